@@ -134,8 +134,23 @@ def _edit(args: f.EditFlags) -> dict[str, Any]:
 
 def _asset(args: f.AssetFlags) -> dict[str, Any]:
     from mudg.stages.editing import assets
+    from mudg.stages.exporting import imports
 
-    return {"asset": assets.run_export(args.run, args.id, args.out, args.scene, args.overwrite)}
+    if args.action == "export":
+        imports.refuse_import_settings(args.settings, args.id)
+        return {"asset": assets.run_export(args.run, args.id, args.out, args.scene, args.overwrite)}
+    if args.id or args.scene is not None:
+        raise UsageError("an import takes a file alone", got=args.id or f"--scene {args.scene}", remedy="leave it out")
+    return {"asset": imports.run(args.settings, args.run, args.out, overwrite=args.overwrite)}
+
+
+def _export(args: f.ExportFlags) -> dict[str, Any]:
+    from mudg.stages.exporting import export
+
+    made = export.run(
+        args.settings, args.format, args.run, args.out, scene=args.scene, edits=args.edits, overwrite=args.overwrite
+    )
+    return {"exported": made}
 
 
 def _score(args: f.Score) -> dict[str, Any]:
@@ -277,9 +292,17 @@ VERBS: dict[str, Verb] = {
         _edit,
     ),
     "asset": Verb(
-        "Write an object of a fitted scene to a file, to be inserted into other drives.",
-        ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",),
+        "Write an object of a fitted scene, or Gaussians of another program, to a file to be inserted into drives.",
+        ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",
+         "mudg asset import van.ply --label van --length-m 5.2 --out assets/van.safetensors"),
         _asset,
+    ),
+    "export": Verb(
+        "Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.",
+        ("mudg export ply runs/kitti --out kitti.ply --time-s 1.5", "mudg export usdz runs/kitti --out kitti.usdz",
+         "mudg export glb runs/mudg_s --scene scenes/city --edits edits.yaml --out city.glb",
+         "mudg export colmap scenes/city --out city_colmap"),
+        _export,
     ),
     "score": Verb(
         "Compare views with ground truth: metrics, tables, error images.",
@@ -301,6 +324,7 @@ SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
     ("change a drive", ("edit", "asset")),
+    ("other programs", ("export",)),
     ("benchmarks", ("bench",)),
     ("published models", ("convert",)),
 )

@@ -200,21 +200,43 @@ class EditFlags(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportFlags(Common):
+    """Flags of ``mudg export``."""
+
+    format: Annotated[str, tyro.conf.Positional, arg(metavar="FORMAT")]
+    """Gaussians: ply, bundle, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras and images: nerfstudio, colmap, colmap-text.
+    The log over time: mcap."""
+    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
+    """Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory."""
+    out: Annotated[Path, arg(metavar="OUT")]
+    """File to write, with the suffix of the format; for cameras, folder to write."""
+    scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
+    """Edit script (docs/edit.md) to carry out before."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace the output if it exists."""
+    settings: Annotated[stage_config.ExportConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class AssetFlags(Common):
     """Flags of ``mudg asset``."""
 
-    action: Annotated[Literal["export"], tyro.conf.Positional, arg(metavar="export")]
-    """What to do: export writes one object to a file."""
-    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
-    """Gaussian scene written by fit, or folder of a finished mudg run."""
-    id: Annotated[str, tyro.conf.Positional, arg(metavar="ID")]
-    """Track id of a dynamic object."""
+    action: Annotated[Literal["export", "import"], tyro.conf.Positional, arg(metavar="export|import")]
+    """What to do. export: write one object of a fitted scene to a file. import: make such a file of Gaussians from another program."""
+    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN|FILE")]
+    """export: Gaussian scene written by fit, or folder of a finished mudg run. import: file of Gaussians (.ply, .spz, .splat,
+    .sog, .glb)."""
+    id: Annotated[str, tyro.conf.Positional, arg(metavar="[ID]")] = ""
+    """export: track id of a dynamic object."""
     out: Annotated[Path, arg(metavar="FILE.safetensors")]
-    """File to write."""
+    """File to write; with --kind scene, folder to write."""
     scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Scene directory that a Gaussian scene was fitted to: it tells from which sides the object was seen. A run has its own."""
+    """export: scene directory that a Gaussian scene was fitted to; it tells from which sides the object was seen. A run has its own."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Replace the file if it exists."""
+    """Replace the output if it exists."""
+    settings: Annotated[stage_config.ImportConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +329,7 @@ class Doctor(Common):
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
     "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
-    "edit": EditFlags, "asset": AssetFlags,
+    "edit": EditFlags, "asset": AssetFlags, "export": ExportFlags,
 }  # fmt: skip
 
 

@@ -162,6 +162,31 @@ def export_asset(
     return assets.run_export(Path(source), track_id, Path(out), _optional(scene), overwrite)
 
 
+def import_asset(
+    file: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+) -> Path:
+    """Make an asset, or with ``kind="scene"`` the folder of a fit, of a file of Gaussians from another program; returns it."""
+    from mudg.stages.exporting import imports
+
+    return imports.run(_settings(stage_config.ImportConfig, config, settings), Path(file), Path(out), overwrite=overwrite)
+
+
+def export(
+    format: str, source: Location, out: Location, *,
+    scene: Location | None = None, edits: Location | None = None, overwrite: bool = False,
+    config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Write a fitted scene, or the cameras of its log, for other programs; returns the file or folder.
+
+    Args:
+        format: ``ply``, ``spz``, ``usdz``, ... (``docs/export.md``). source: folder of a fit, of ``run``, or of a scene.
+    """
+    from mudg.stages.exporting import export as stage
+
+    made = _settings(stage_config.ExportConfig, config, settings)
+    return stage.run(made, format, Path(source), Path(out), scene=_optional(scene), edits=_optional(edits), overwrite=overwrite)
+
+
 def score(
     scene: Location, views: Mapping[str, Location], out: Location, *,
     fused: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,

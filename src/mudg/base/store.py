@@ -15,7 +15,7 @@ import stat
 import tempfile
 import threading
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -110,6 +110,13 @@ def atomic_write(path: Path, content: bytes) -> None:
     """Write ``content`` to ``path`` completely or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_blocks(path: Path, blocks: Iterable[bytes]) -> None:
+    """Write a file block by block, completely or not at all, for what does not fit into memory."""
+    with atomic_path(path) as temporary, temporary.open("wb") as handle:
+        for block in blocks:
+            handle.write(block)
 
 
 def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options: Any) -> None:

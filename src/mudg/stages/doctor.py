@@ -25,6 +25,7 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
     "transformers": ("networks of annotate from folders", "pip install 'mudg[models]'"),
     "diffusers": ("Marigold in annotate", "pip install 'mudg[models]'"),
     "gsplat": ("faster rasteriser on CUDA devices", "pip install 'mudg[gsplat]'"),
+    "zstandard": ("SPZ files of version 4", "pip install zstandard"),
     "tensorboard": ("curves of learn --tensorboard", "pip install 'mudg[track]'"),
 }
 

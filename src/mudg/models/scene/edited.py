@@ -111,6 +111,18 @@ def ground_points(model: SceneModel) -> NDArray[np.float32]:
     return model.table["means"].detach().cpu().numpy()[rows]
 
 
+def lowest_points(model: SceneModel) -> NDArray[np.float32]:
+    """Centres f32[M, 3] of the solid Gaussians of the background that are the lowest fifth of their square metre: the ground, where no
+    class says what it is."""
+    rows = (model.table.labels["node"] == 0).cpu().numpy() & (torch.sigmoid(model.table["logits"].detach()).cpu().numpy() > SOLID_OPACITY)
+    means = model.table["means"].detach().cpu().numpy()[rows]
+    cells = np.floor(means[:, :2]).astype(np.int64)
+    order = np.lexsort((means[:, 2], cells[:, 1], cells[:, 0]))
+    _, begins, counts = np.unique(cells[order], axis=0, return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(begins, counts)
+    return means[order[rank < np.repeat(np.ceil(counts / 5), counts)]]
+
+
 def road_color(model: SceneModel) -> NDArray[np.float64] | None:
     """Median colour f64[3] of the road's Gaussians, display values; None where there are fewer than 50."""
     still = (model.table.labels["node"] == 0).cpu().numpy()

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.bench import BenchConfig
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.edit import EditConfig
+    from mudg.stages.config.export import ExportConfig, ImportConfig
     from mudg.stages.config.fit import FitConfig
     from mudg.stages.config.harmonize import HarmonizeConfig
     from mudg.stages.config.learn import LearnConfig
@@ -27,12 +28,14 @@ _HOMES = {
     "BenchConfig": "mudg.stages.config.bench",
     "ConvertConfig": "mudg.stages.config.convert",
     "EditConfig": "mudg.stages.config.edit",
+    "ExportConfig": "mudg.stages.config.export",
     "FitConfig": "mudg.stages.config.fit",
     "HarmonizeConfig": "mudg.stages.config.harmonize",
     "LearnConfig": "mudg.stages.config.learn",
     "AdaptConfig": "mudg.stages.config.adapt",
     "AnnotateConfig": "mudg.stages.config.prepare",
     "FuseConfig": "mudg.stages.config.prepare",
+    "ImportConfig": "mudg.stages.config.export",
     "IngestConfig": "mudg.stages.config.prepare",
     "DEMO_CITY": "mudg.stages.config.presets",
     "PRESETS": "mudg.stages.config.presets",
@@ -57,9 +60,11 @@ __all__ = [
     "BenchConfig",
     "ConvertConfig",
     "EditConfig",
+    "ExportConfig",
     "FitConfig",
     "FuseConfig",
     "HarmonizeConfig",
+    "ImportConfig",
     "IngestConfig",
     "LearnConfig",
     "PresetName",

@@ -17,7 +17,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript, read_edits
 from mudg.data.edits.records import AssetSource
 from mudg.data.scene import read_scene
-from mudg.models.scene.edited import GROUND_CLASSES, Asset, ground_points
+from mudg.models.scene.edited import GROUND_CLASSES, Asset, ground_points, lowest_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.editing.apply import EGO_FACT, edited_cloud, edited_model, edited_scene, ego_fact, ground_of
 from mudg.stages.editing.assets import asset_from, read_asset
@@ -27,6 +27,8 @@ from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.editing.weathered import conditions_of
 from mudg.stages.fitting.storage import load_model
 
+IMPORTED = "imported"
+"""Method of a scene that was read from a file of another program."""
 FACT = "edits"
 """Fact of an edited fitted scene: the script, its digest, and what its checks found."""
 
@@ -86,14 +88,17 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
 
 
 def background_of(parts: RunParts, name: str) -> Background:
-    """The street of a run.
+    """The street of a run; or of a file, which begins at its origin and leads along x.
 
     Raises:
         InputError: a fit by itself, of which the path of the vehicle is not known, or one without ground.
     """
+    if parts.scene is None and (found := load_model(parts.model)).facts.get("method") == IMPORTED:
+        known = ground_points(found)
+        return Background(found, Motion.recorded([0.0], np.eye(4)[None]), known if len(known) else lowest_points(found))
     if parts.scene is None:
         raise InputError("of a fit alone it is not known where its street lies", where="run", got=name,
-            expected="a folder made by `mudg run`")  # fmt: skip
+            expected="a folder made by `mudg run` or by `mudg asset import --kind scene`")  # fmt: skip
     scene, model = read_scene(parts.scene), load_model(parts.model)
     ground, cloud = ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
     if cloud is not None and cloud.semantics is not None:

@@ -1,0 +1,49 @@
+"""Settings of ``mudg export`` and ``mudg asset import``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from mudg.base.config import STRICT
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ExportConfig:
+    """Write a fitted scene, or the cameras of its log, for other programs."""
+
+    time_s: float | None = None
+    """Moment at which moving objects are taken, on the scene's clock (not given: formats with motion hold all of it, others the middle
+    of the log)."""
+    animated: bool = False
+    """Require that the file holds the motion: a format that cannot is refused."""
+    nodes: tuple[str, ...] = ()
+    """Track ids of the objects to write, and background for what stands (not given: everything)."""
+    axes: Literal["viewer", "world"] = "viewer"
+    """viewer: axes that programs expect of the format. world: x forward, y left, z up in every format."""
+    sky: Literal["keep", "none", "sphere"] = "keep"
+    """keep: a panorama, in formats that hold one. none: no sky. sphere: 6000 flat Gaussians 300 m away, in every format."""
+    spz_version: Literal[3, 4] = 3
+    """Version of spz. 4 needs the package zstandard."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ImportConfig:
+    """Read a file of Gaussians as an object that edit scripts can insert, or as a scene."""
+
+    kind: Literal["object", "scene"] = "object"
+    """object: an asset file. scene: the folder of a fit in which nothing moves."""
+    label: str = "object"
+    """Class of the object, e.g. car or pedestrian."""
+    length_m: float | None = Field(default=None, gt=0)
+    """Scale the object so that its box has this length (not given: the file is in metres)."""
+    yaw_deg: float = 0.0
+    """Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads,
+    along x."""
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg. As a background of an edit
+    script, a street begins there."""
+    axes: Literal["viewer", "world"] = "viewer"
+    """Axes of the file. viewer: those that programs expect of its format. world: x forward, y left, z up, as of --axes world."""

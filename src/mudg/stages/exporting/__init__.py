@@ -1,0 +1,1 @@
+"""Parts of ``mudg export``, and of ``mudg asset import``."""

@@ -1,0 +1,286 @@
+"""export: a fitted scene, or the cameras of its log -> a file or folder for other programs.
+
+Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
+cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
+messages:   OUT.mcap
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mudg.base import log, store
+from mudg.base.config import result_settings
+from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
+from mudg.base.types import PointCloud, Scene
+from mudg.base.versions import version
+from mudg.core.sh import C0
+from mudg.data.cloudfile import read_fused
+from mudg.data.exporters.colmap import colmap_files
+from mudg.data.exporters.mcap import LogMessages, McapBlocks
+from mudg.data.exporters.nerfstudio import nerfstudio_files
+from mudg.data.exporters.pictures import picture_names, pictures
+from mudg.data.scene import read_points, read_scene
+from mudg.data.scene.files import open_files
+from mudg.data.splats.cloud import SplatScene
+from mudg.data.splats.formats import FORMATS, WriteRequest, file_from_world, losses
+from mudg.models.scene.model import SceneModel
+from mudg.stages.config import ExportConfig
+from mudg.stages.editing.carried import carry_out, read_and_digest
+from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.exporting.scenes import splat_scene, with_sky_sphere
+from mudg.stages.fitting.storage import load_model, model_of_scene
+
+CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes]]]] = {
+    "nerfstudio": nerfstudio_files, "colmap": colmap_files,
+    "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
+}  # fmt: skip
+"""Formats of cameras: files beside the pictures."""
+MESSAGES: Final = "mcap"
+MOST_POINTS: Final = 500_000
+_FOLDER = VerbOutput("export", 1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exported:
+    """What is exported.
+
+    Args:
+        parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene, edited, or None.
+        inputs: digests of what was read. named: files that the edit script names.
+    """
+
+    parts: RunParts
+    model: SceneModel | None
+    log: Scene | None
+    inputs: dict[str, str]
+    named: dict[str, Path] = field(default_factory=dict)
+
+
+def run(
+    config: ExportConfig, name: str, source: Path, out: Path, *,
+    scene: Path | None = None, edits: Path | None = None, overwrite: bool = False,
+) -> Path:  # fmt: skip
+    """Export in a format; returns ``out``.
+
+    Args:
+        name: of the format. source: folder of a fit, of a finished ``mudg run``, or, for cameras, of a scene.
+        scene: the scene that a fit belongs to; a run's own is found. edits: an edit script to carry out before.
+
+    Raises:
+        UsageError: an unknown format, or a setting that it does not have. InputError: nothing that can be exported.
+    """
+    if name not in FORMATS and name not in CAMERAS and name != MESSAGES:
+        known = ", ".join((*FORMATS, *CAMERAS, MESSAGES))
+        raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
+    cameras = name in CAMERAS
+    refuse_overlap(out, {"run": source, "scene": scene, "edits": edits})
+    _refuse_settings(config, name)
+    given = _opened(source, scene, edits, name in FORMATS)
+    refuse_overlap(out, {"scene": given.parts.scene, **given.named})
+    if cameras:
+        return _cameras(config, name, given, out, overwrite)
+    _refuse_name(out, name, overwrite)
+    if name == MESSAGES:
+        return _messages(given, Path(out))
+    request = requested(config, name, given)
+    content = FORMATS[name].write(request)
+    _written(out, name, config, request, content, given.inputs)
+    return Path(out)
+
+
+def _refuse_settings(config: ExportConfig, name: str) -> None:
+    moves = name in FORMATS and "motion" in FORMATS[name].carries
+    if config.animated and config.time_s is not None:
+        raise UsageError(
+            "a file holds one moment or the motion", where="--animated, --time-s", remedy="leave one of them out"
+        )
+    if config.animated and not moves:
+        able = ", ".join(key for key, one in FORMATS.items() if "motion" in one.carries)
+        raise UsageError(
+            "this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s"
+        )
+    if name == "bundle" and config.time_s is not None:
+        raise UsageError("a bundle holds all moments", where="--time-s", remedy="leave it out, or export ply")
+    set_here = [
+        key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
+    ]
+    refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
+    if refused:
+        flag = refused[0].replace("_", "-")
+        raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
+
+
+def _refuse_name(out: Path, name: str, overwrite: bool) -> None:
+    suffixes = (".mcap",) if name == MESSAGES else FORMATS[name].suffixes
+    if not Path(out).name.lower().endswith(suffixes):
+        expected = f"a name that ends in {' or '.join(suffixes)}"
+        raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
+    for path in (Path(out), about_path(out)):
+        if path.exists() and not overwrite:
+            raise UsageError("the file exists", where=str(path), remedy="choose another --out, or add --overwrite")
+
+
+def about_path(out: Path) -> Path:
+    """The file beside an export that says what it is."""
+    return Path(out).with_name(Path(out).name + ".json")
+
+
+def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: bool) -> Exported:
+    """The parts of a source, with an edit script carried out."""
+    source = Path(source)
+    alone = not needs_model and ((source / "scene.json").is_file() or source.suffix == ".zip")
+    parts = RunParts({}, source, None, False) if alone else find_run(source)
+    place = scene or parts.scene
+    inputs = {f"fit {key}".strip(): store.digest(path) for key, path in parts.fits.items() if path == parts.model}
+    if place is not None:
+        inputs["scene"] = store.digest(place)
+    recorded = None if place is None else read_scene(place)
+    if alone and edits is None:
+        return Exported(parts, None, recorded, inputs)
+    if alone:
+        raise UsageError(
+            "an edit script is carried out on a fit",
+            where="--edits",
+            got=str(source),
+            remedy="give the folder of a run",
+        )
+    model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
+    named: dict[str, Path] = {}
+    if edits is not None:
+        script, inputs["edits"] = read_and_digest(Path(edits))
+        drive = carry_out(script, model, recorded)
+        model, recorded = drive.model(model), drive.scene or recorded
+        named = {f"{edits}: {name}": path for name, path in script.files().items()}
+    return Exported(parts, model, recorded, inputs, named)
+
+
+# -- Gaussians -----------------------------------------------------------------------------------------------------------
+
+
+def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
+    """The scene in the axes of the format, and the moment."""
+    if given.model is None:
+        raise InputError(
+            "there is no fitted scene",
+            where=str(given.parts.scene),
+            expected="a folder made by `mudg fit` or `mudg run`",
+        )
+    moment = config.time_s if config.time_s is not None else middle_s(given.model, given.log)
+    scene = splat_scene(given.model, moment, config.nodes)
+    whole = "motion" in FORMATS[name].carries and config.time_s is None
+    if not scene.nodes or not (whole or any(node.at(moment) is not None and len(node.cloud) for node in scene.nodes)):
+        asked = ", ".join(config.nodes) or "everything"
+        raise UsageError("there is nothing to export", where="--nodes, --time-s", got=f"{asked} at {moment:g} s",
+            remedy="choose a time at which the object is there")  # fmt: skip
+    if config.sky == "sphere":
+        scene = with_sky_sphere(scene)
+    elif config.sky == "none":
+        scene = replace(scene, sky=None)
+    facts = {**scene.facts, "generator": f"mudg {version()}"}
+    scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
+    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log)
+
+
+def middle_s(model: SceneModel, recorded: Scene | None) -> float:
+    """The time of the log's middle image; without a log, the middle of what moves; 0 if nothing does."""
+    if recorded is not None and recorded.frames:
+        return float(np.sort([frame.view.time_s for frame in recorded.frames])[len(recorded.frames) // 2])
+    keys = [times for node in model.nodes if len(times := getattr(node, "times_s", ()))]
+    return 0.0 if not keys else (min(float(k[0]) for k in keys) + max(float(k[-1]) for k in keys)) / 2
+
+
+def _written(
+    out: Path, name: str, config: ExportConfig, request: WriteRequest, content: bytes, inputs: Mapping[str, str]
+) -> None:
+    """The file, and beside it what it is."""
+    lost = losses(name, request)
+    count = _count(request.scene) if request.time_s is None else len(request.cloud)
+    store.atomic_write(Path(out), content)
+    about: dict[str, Any] = {
+        "schema": 1, "format": name, "mudg": version(), "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content),
+        "gaussians": count, "degree": request.scene.degree, "time_s": request.time_s, "axes": config.axes,
+        "file_from_world": request.scene.file_from_world, "nodes": [node.name for node in request.scene.nodes],
+        "not_in_the_file": lost, "inputs": dict(inputs),
+    }  # fmt: skip
+    store.write_json(about_path(out), about)
+    when = "all of the motion" if request.time_s is None else f"at {request.time_s:g} s"
+    log.info(f"export: {count} Gaussians, {when}, {len(content) / 1e6:.2f} MB in {out}")
+    for sentence in lost:
+        log.warn(f"export: {name} does not hold {sentence}")
+
+
+def _count(scene: SplatScene) -> int:
+    return sum(len(node.cloud) for node in scene.nodes)
+
+
+# -- cameras -------------------------------------------------------------------------------------------------------------
+
+
+def _cameras(config: ExportConfig, name: str, given: Exported, out: Path, overwrite: bool) -> Path:
+    """A folder of cameras, pictures and starting points."""
+    recorded = _known(given)
+    folder = RunDir.open(out, _FOLDER, {**result_settings(config), "format": name}, given.inputs, overwrite)
+    if folder.complete:
+        return folder.reused()
+    names = picture_names(recorded)
+    try:
+        with log.task("export", len(names)) as bar:
+            for place, content in pictures(recorded):
+                if not (folder.path / place).is_file():
+                    store.atomic_write(folder.path / place, content)
+                bar.advance()
+    except KeyboardInterrupt:
+        folder.pause()
+        raise
+    for place, content in CAMERAS[name](recorded, _points(given)).items():
+        store.atomic_write(folder.path / place, content)
+    folder.finish({"format": name, "images": len(names)})
+    return folder.path
+
+
+def _messages(given: Exported, out: Path) -> Path:
+    """The log as messages over time."""
+    recorded = _known(given)
+    files = open_files(recorded.root)
+    messages = LogMessages(
+        recorded, lambda frame: files.read(frame.image.path), lambda sweep: read_points(recorded, sweep), _points(given)
+    )
+    store.write_blocks(out, McapBlocks(messages, f"mudg {version()}"))
+    log.info(
+        f"export: {len(recorded.frames)} pictures, {len(recorded.sweeps)} sweeps, {out.stat().st_size / 1e6:.2f} MB in {out}"
+    )
+    return out
+
+
+def _known(given: Exported) -> Scene:
+    """The recorded scene; InputError if none is known."""
+    if given.log is None:
+        raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
+            remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
+    if given.model is not None and "edits" in given.inputs:
+        log.warn(
+            "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"
+        )
+    return given.log
+
+
+def _points(given: Exported) -> PointCloud | None:
+    """Starting points: fused ones, else the centres of the solid Gaussians of the background."""
+    if given.parts.fused is not None:
+        static = read_fused(given.parts.fused).static
+        step = -(-len(static) // MOST_POINTS) or 1
+        return PointCloud(static.xyz[::step].copy(), static.rgb[::step].copy(), "world")
+    if given.model is None:
+        return None
+    cloud = splat_scene(given.model, 0.0, (given.model.nodes[0].name,)).nodes[0].cloud
+    solid = cloud.take(cloud.opacity > 0.5)
+    rgb = np.round((solid.sh[:, 0] * C0 + 0.5).clip(0, 1) * 255).astype(np.uint8)
+    return PointCloud(np.ascontiguousarray(solid.means), rgb, "world")

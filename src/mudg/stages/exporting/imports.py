@@ -1,0 +1,138 @@
+"""asset import: a file of Gaussians from another program -> an asset that edit scripts can insert, or a scene in which nothing moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+
+from mudg.base import geometry, log, store
+from mudg.base.config import result_settings
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import CLASSES, ID
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.data.splats.binary import MAX_BYTES
+from mudg.data.splats.cloud import SplatCloud
+from mudg.data.splats.formats import read_cloud
+from mudg.models.scene.edited import Asset
+from mudg.stages.config import ImportConfig
+from mudg.stages.editing.assets import write_asset
+from mudg.stages.exporting.scenes import model_of_cloud
+from mudg.stages.fitting.storage import save_model
+
+TRAIN_IDS: Final = {
+    "pedestrian": ID["person"], "adult": ID["person"], "child": ID["person"], "cyclist": ID["rider"], "van": ID["car"], "tram": ID["train"],
+    "tree": ID["vegetation"], "sign": ID["traffic sign"],
+}  # fmt: skip
+"""Classes of labels that are not named as their class."""
+SOLID: Final = 0.3
+"""Opacity from which Gaussians count for the size of an object."""
+OUTSIDE: Final = 0.5
+"""Percent of the solid Gaussians at either end of an axis that may stand out of the box."""
+_FOLDER = VerbOutput("asset", 1, ("model.json", "gaussians.safetensors", "nodes.safetensors"))
+
+
+def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False) -> Path:
+    """Import a file; returns ``out``.
+
+    Raises:
+        InputError: no such file, another format, or a damaged one. UsageError: the output exists. ResourceError: a package is missing.
+    """
+    refuse_overlap(out, {"file": file})
+    refuse_other_settings(config)
+    if config.kind == "scene":
+        return _scene(config, Path(file), Path(out), overwrite)
+    if Path(out).suffix != ".safetensors":
+        raise UsageError(
+            "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
+        )
+    if Path(out).exists() and not overwrite:
+        raise UsageError("the file exists", where=str(out), remedy="choose another --out, or add --overwrite")
+    cloud, found = read_file(Path(file), config)
+    asset = asset_of_cloud(cloud, config, f"{Path(file).name} ({found})")
+    write_asset(Path(out), asset)
+    length, width, height = asset.size_m
+    log.info(f"asset: {len(asset)} Gaussians of a {found} file, {length:.2f} x {width:.2f} x {height:.2f} m, in {out}")
+    if cloud.degree:
+        log.info("asset: colours that depend on the direction of view are not kept")
+    return Path(out)
+
+
+def refuse_import_settings(config: ImportConfig, name: str) -> None:
+    """UsageError for settings that ``asset export`` does not have, or without the name of an object."""
+    if config != ImportConfig():
+        raise UsageError("an asset export takes no settings of imports", where="--kind, --label, --length-m, --yaw-deg, --origin-m, --axes",
+            remedy="leave them out")  # fmt: skip
+    if not name:
+        raise UsageError("no object was named", expected="mudg asset export RUN ID --out FILE")
+
+
+def refuse_other_settings(config: ImportConfig) -> None:
+    """UsageError for settings that belong to the other kind."""
+    usual = ImportConfig()
+    if config.kind == "scene" and (config.label, config.length_m) != (usual.label, usual.length_m):
+        raise UsageError("a scene takes no settings of objects", where="--label, --length-m", remedy="leave them out")
+    if config.kind == "object" and config.origin_m != usual.origin_m:
+        raise UsageError(
+            "an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene"
+        )
+
+
+def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
+    """The Gaussians of a file in the axes of this program, and its format."""
+    try:
+        size = file.stat().st_size
+    except OSError as error:
+        raise InputError("file not found", where=str(file)) from error
+    if size > MAX_BYTES:
+        raise InputError("the file is too large", where=str(file), expected=f"at most {MAX_BYTES} bytes", got=str(size))
+    return read_cloud(store.read_bytes(file), str(file), config.axes)
+
+
+def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asset:
+    """Gaussians as an object: turned, centred in their box, scaled to its length."""
+    cloud = cloud.moved(geometry.yaw_matrix(np.radians(config.yaw_deg)))
+    solid = cloud.means[cloud.opacity > SOLID]
+    if len(solid) < 2:
+        expected = f"opacities above {SOLID}"
+        raise InputError(
+            "the file holds no solid Gaussians", where=origin, expected=expected, got=f"{len(solid)} of them"
+        )
+    low, high = np.percentile(solid.astype(np.float64), [OUTSIDE, 100 - OUTSIDE], 0)
+    size = np.maximum(high - low, 1e-3)
+    scale = 1.0 if config.length_m is None else config.length_m / float(size[0])
+    means = ((cloud.means - (low + high) / 2) * scale).astype(np.float32)
+    logs = (cloud.log_scales + np.log(scale)).astype(np.float32)
+    columns = {
+        "means": means,
+        "quats": cloud.quats,
+        "log_scales": logs,
+        "logits": cloud.logits,
+        "sh_dc": cloud.sh[:, :1],
+    }
+    label = config.label.strip().lower()
+    ids = np.full(len(cloud), TRAIN_IDS.get(label, ID.get(label, -1)), np.int64)
+    if cloud.class_ids is not None:
+        ids = np.where(cloud.class_ids < len(CLASSES), cloud.class_ids.astype(np.int64), ids)
+    length, width, height = (float(value) for value in size * scale)
+    tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
+    return Asset(tensors, ids, None, config.label, (length, width, height), None, (), origin)
+
+
+def _scene(config: ImportConfig, file: Path, out: Path, overwrite: bool) -> Path:
+    """The folder of a fit in which nothing moves."""
+    cloud, found = read_file(file, config)
+    folder = RunDir.open(out, _FOLDER, result_settings(config), {"file": store.digest(file)}, overwrite)
+    if folder.complete:
+        return folder.reused()
+    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(
+        0.0, [-value for value in config.origin_m]
+    )
+    model = model_of_cloud(cloud.moved(begin), file.name)
+    save_model(replace(model, facts={**model.facts, "format": found}), folder.path)
+    folder.finish({"gaussians": len(cloud), "format": found})
+    log.info(f"asset: a scene of {len(cloud)} Gaussians of a {found} file in {out}")
+    return folder.path

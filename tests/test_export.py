@@ -1,0 +1,475 @@
+"""`mudg export` and `mudg asset import`: what comes back renders as the fit does; what a format cannot hold is said."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import zipfile
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import splat_readers as slow
+import torch
+import toy_splats
+from test_edit import SIZE, toy
+from test_edit import view as toy_view
+from toy_scene import ToyStreet
+
+from mudg import cli
+from mudg.base import geometry
+from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.types import View
+from mudg.core.edit import Motion
+from mudg.core.ground import HeightMap
+from mudg.core.metrics import psnr
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.exporters.colmap import colmap_files, rig_frames, sensors_from_rig
+from mudg.data.exporters.nerfstudio import nerfstudio_files
+from mudg.data.splats import formats
+from mudg.data.splats.cloud import SplatCloud
+from mudg.models.scene.bezier import BezierNode
+from mudg.models.scene.model import SceneModel, compose
+from mudg.models.scene.nodes import DeformableNode, RigidNode
+from mudg.models.scene.vibration import VibrationNode, starting_columns
+from mudg.stages.config import ExportConfig, ImportConfig
+from mudg.stages.editing.assets import read_asset
+from mudg.stages.editing.carried import background_of
+from mudg.stages.editing.plan import EditWorld, place_background
+from mudg.stages.editing.runs import find_run
+from mudg.stages.exporting import export, imports, scenes
+from mudg.stages.fit import render_view
+from mudg.stages.fitting.storage import load_model, save_model
+
+LEAST_DB = {"ply": 50, "glb": 50, "usda": 50, "spz": 38, "compressed-ply": 38, "sog": 38, "splat": 30}
+T = 0.5
+
+
+def turning(kind: type[RigidNode] = RigidNode) -> SceneModel:
+    """The toy scene of the edits with a car that turns."""
+    model = toy(kind)
+    node = model.nodes[1]
+    assert isinstance(node, RigidNode)
+    keys = np.stack(
+        [pose @ geometry.yaw_matrix(0.5 * t) for t, pose in zip(node.times_s, node.world_from_object, strict=True)]
+    )
+    turned = kind("car-1", "car", SIZE, node.times_s, keys, None if kind is BezierNode else node.offsets)
+    return replace(model, nodes=(model.nodes[0], turned))
+
+
+def picture(model: SceneModel, time_s: float = T) -> torch.Tensor:
+    return render_view(model, toy_view(time_s), RasterConfig(backend="cpu")).rgb
+
+
+def db(model: SceneModel, cloud: SplatCloud, time_s: float = T) -> float:
+    again = replace(scenes.model_of_cloud(cloud, "x"), sky=model.sky)
+    return float(psnr(picture(again, time_s), picture(model, time_s)))
+
+
+def baked(model: SceneModel, name: str, time_s: float = T) -> SplatCloud:
+    """The model at a time, through a file."""
+    given = export.Exported(export.RunParts({}, None, None, False), model, None, {})
+    request = export.requested(ExportConfig(time_s=time_s), name, given)
+    content = formats.FORMATS[name].write(request)
+    if name != "usda":
+        return formats.read_cloud(content, f"x.{name}")[0]
+    splats = slow.read_usd_splats(slow.parse_usda(content.decode())["World"]["scene"]["splats"])
+    columns = ([s.place for s in splats], [s.turn for s in splats], np.log([s.size for s in splats]),
+               np.log([s.opacity / (1 - s.opacity) for s in splats]), [s.sh for s in splats])  # fmt: skip
+    return SplatCloud(*(np.asarray(values, np.float32) for values in columns))
+
+
+@pytest.mark.parametrize("name", LEAST_DB)
+def test_what_comes_back_renders_as_the_fit_does(name: str) -> None:
+    assert db(turning(), baked(turning(), name)) >= LEAST_DB[name]
+
+
+@pytest.mark.parametrize("name", ["ply", "glb", "usda", "spz"])
+def test_harmonics_of_what_stands_come_back(name: str) -> None:
+    """Axes are turned there and back, harmonics with them."""
+    model = toy()
+    g = torch.Generator().manual_seed(3)
+    columns = {key: value.detach() for key, value in model.table.columns.items()}
+    rows = model.table.labels["node"] == 0
+    columns["sh_rest"] = torch.randn(len(model.table), 15, 3, generator=g) * 0.1 * rows[:, None, None]
+    bent = replace(model, table=type(model.table)(columns, model.table.labels), sh_degree=3)
+    assert float(psnr(picture(bent), picture(model))) < 35  # they show
+    assert db(bent, baked(bent, name)) >= LEAST_DB[name]
+
+
+@pytest.mark.parametrize("kind", [RigidNode, DeformableNode, BezierNode])
+def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNode]) -> None:
+    model = turning(kind)
+    if kind is DeformableNode:
+        with torch.no_grad():
+            node = model.nodes[1]
+            assert isinstance(node, DeformableNode)
+            node.offsets["deform"].normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
+    if kind is BezierNode:
+        columns = {key: value.detach() for key, value in model.table.columns.items()}
+        columns["curve"] = torch.randn(len(model.table), 4, 3, generator=torch.Generator().manual_seed(1)) * 0.1
+        model = replace(model, table=type(model.table)(columns, model.table.labels))
+    columns = {key: value.detach() for key, value in model.table.columns.items()}
+    columns["sh_rest"] = torch.randn(len(model.table), 8, 3, generator=torch.Generator().manual_seed(2))
+    model = replace(model, table=type(model.table)(columns, model.table.labels), sh_degree=2)
+    keys = model.nodes[1].times_s  # type: ignore[union-attr]
+    for time_s in (float(keys[3]), float((keys[3] + keys[4]) / 2)):
+        scene = scenes.splat_scene(model, time_s)
+        now = compose(model, time_s)
+        apart = np.abs(scene.at(time_s).means - now.means.detach().numpy()).max()
+        assert now.sh_rest is not None  # exact at the moment, in whichever frame the fit has them
+        assert np.abs(scene.at(time_s).sh[:, 1:] - now.sh_rest.detach().numpy()).max() < 1e-5
+        assert apart < (5e-3 if kind is BezierNode else 1e-5)  # curves are straight between keys in a file
+
+
+def test_a_background_that_changes_with_time_is_taken_at_the_moment() -> None:
+    model = toy().without_nodes(["car-1"])
+    columns = {key: value.detach() for key, value in model.table.columns.items()}
+    columns |= starting_columns(len(model.table), torch.linspace(-0.1, 0.1, len(model.table)), 0.2)
+    columns["velocity"] = torch.randn(len(model.table), 3, generator=torch.Generator().manual_seed(1)) * 5
+    node = VibrationNode("background", 0.5, 0.1)
+    moving = replace(model, table=type(model.table)(columns, model.table.labels), nodes=(node,))
+    assert db(moving, baked(moving, "ply", 0.7), 0.7) > 50
+    assert db(moving, baked(moving, "ply", 0.2), 0.7) < 40
+
+
+def test_the_sky_as_gaussians_looks_as_the_sky() -> None:
+    model = toy()
+    assert model.sky is not None
+    rows = model.sky.rows
+    ramp = torch.linspace(0.2, 0.9, 2 * rows).expand(rows, -1)
+    down = torch.linspace(0, 1, rows)[:, None].expand(-1, 2 * rows)
+    model.sky.table.columns["panorama"].detach().copy_(torch.stack([ramp, ramp.flip(1), down])[None])
+    scene = scenes.with_sky_sphere(scenes.splat_scene(model, T))
+    assert scene.sky is None and scene.nodes[-1].name == "sky"
+    alone = scenes.model_of_cloud(scene.nodes[-1].cloud, "sky")
+    empty = replace(model, table=alone.table, nodes=alone.nodes, classes=())
+    camera = toy_view().camera
+    for yaw in (0.0, 2.0, 4.0):
+        up = geometry.yaw_matrix(yaw) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
+        view = View(camera, up, T)
+        truth = render_view(replace(empty, table=type(alone.table)({k: v.detach()[:1] * 0 - 50 for k, v in alone.table.columns.items()},
+                                    {"node": torch.zeros(1, dtype=torch.int32)})), view, RasterConfig(backend="cpu")).rgb  # fmt: skip
+        shown = render_view(replace(empty, sky=None), view, RasterConfig(backend="cpu")).rgb
+        assert float(psnr(shown, truth)) > 28
+
+
+# -- the verb ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def fit(tmp_path: Path) -> Path:
+    save_model(turning(), tmp_path / "fit")
+    return tmp_path / "fit"
+
+
+def test_the_verb_writes_a_file_and_what_it_is(fit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "a.spz"
+    assert cli.main(["export", "spz", str(fit), "--out", str(out), "--time-s", "0.5"]) == 0
+    said = capsys.readouterr().err
+    assert "spz does not hold motion (car-1 as at 0.5 s)" in said and "classes" in said and "sky" in said
+    about = json.loads((tmp_path / "a.spz.json").read_text())
+    assert about["gaussians"] == 690 and about["time_s"] == 0.5 and about["file_from_world"][0] == [0, -1, 0, 0]
+    assert len(about["not_in_the_file"]) == 3 and about["bytes"] == out.stat().st_size
+    assert cli.main(["export", "spz", str(fit), "--out", str(out)]) == 2  # it exists
+    before = out.read_bytes()
+    assert cli.main(["export", "spz", str(fit), "--out", str(out), "--time-s", "0.5", "--overwrite"]) == 0
+    assert out.read_bytes() == before
+
+
+def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
+    export.run(ExportConfig(nodes=("car-1",)), "usda", fit, tmp_path / "car.usda")
+    stage = slow.parse_usda((tmp_path / "car.usda").read_text())["World"]
+    assert list(stage) == ["type", "car_1"] and len(stage["car_1"]["xformOp:translate"]) == 21
+    script = tmp_path / "edits.yaml"
+    script.write_text("- move: {id: car-1, left_m: 2, ground: false}\n")
+    export.run(ExportConfig(time_s=T), "ply", fit, tmp_path / "moved.ply", edits=script)
+    export.run(ExportConfig(time_s=T), "ply", fit, tmp_path / "plain.ply")
+    moved, plain = (
+        formats.read_cloud((tmp_path / f"{n}.ply").read_bytes(), "x.ply")[0].means for n in ("moved", "plain")
+    )
+    apart = np.linalg.norm(moved - plain, axis=1)
+    assert not apart[:640].any() and np.abs(apart[640:] - 2).max() < 1e-4
+    export.run(ExportConfig(sky="sphere"), "glb", fit, tmp_path / "a.glb")
+    document, _ = slow.open_glb((tmp_path / "a.glb").read_bytes())
+    assert [node["name"] for node in document["nodes"]] == ["background", "car-1", "sky"]
+    export.run(ExportConfig(), "bundle", fit, tmp_path / "a.zip")
+    assert "sky.png" in zipfile.ZipFile(tmp_path / "a.zip").namelist()
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "out", "said"),
+    [
+        ({}, "ncore", "a.ply", "no export format 'ncore'"),
+        ({}, "ply", "a.spz", "does not fit its format"),
+        ({"animated": True}, "ply", "a.ply", "cannot hold motion"),
+        ({"animated": True, "time_s": 1.0}, "glb", "a.glb", "one moment or the motion"),
+        ({"time_s": 1.0}, "bundle", "a.zip", "holds all moments"),
+        ({"spz_version": 4}, "ply", "a.ply", "does not have this setting"),
+        ({"nodes": ("car-7",)}, "ply", "a.ply", "no node 'car-7'"),
+        ({"nodes": ("car-1",), "time_s": 99.0}, "sog", "a.sog", "nothing to export"),
+        ({}, "colmap", "folder", "cameras belong to a scene"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(
+    fit: Path, tmp_path: Path, settings: dict, name: str, out: str, said: str
+) -> None:
+    with pytest.raises(MudgError, match=said):
+        export.run(ExportConfig(**settings), name, fit, tmp_path / out)
+    assert not (tmp_path / out).exists()
+
+
+def test_an_output_inside_the_fit_is_refused(fit: Path) -> None:
+    with pytest.raises(UsageError, match="lies in"):
+        export.run(ExportConfig(), "ply", fit, fit / "a.ply")
+
+
+# -- imports -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["ply", "spz", "splat", "sog", "glb", "compressed-ply"])
+def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_path: Path) -> None:
+    car = toy_splats.cloud(60, 0, 3, spread=1.0)
+    scene = toy_splats.SplatScene(
+        "car", (toy_splats.SplatNode("car", car.moved(geometry.yaw_matrix(0.0, (30, 0, 5)))),)
+    )
+    suffix = formats.FORMATS[name].suffixes[0]
+    file = tmp_path / f"van{suffix}"
+    turned = replace(scene, file_from_world=formats.file_from_world(name, "viewer"))
+    file.write_bytes(formats.FORMATS[name].write(formats.WriteRequest(turned, 0.0)))
+    flags = ["--label", "van", "--length-m", "5", "--yaw-deg", "90", "--out", str(tmp_path / "a.safetensors")]
+    assert cli.main(["asset", "import", str(file), *flags]) == 0
+    asset = read_asset(tmp_path / "a.safetensors")
+    assert asset.label == "van" and abs(asset.size_m[0] - 5) < 1e-3 and set(asset.class_ids.tolist()) == {13}
+    means = asset.columns["means"].numpy()
+    assert np.abs(means.mean(0)).max() < 1.0  # centred
+    scale = 5 / np.ptp(np.percentile(car.means[car.opacity > 0.3][:, 1], [0.5, 99.5]))
+    assert abs(np.ptp(means[:, 0]) / np.ptp(car.means[:, 1]) - scale) < 0.02 * scale  # what lay along y lies along x
+    script = tmp_path / "edits.yaml"
+    script.write_text("- insert: {asset: {file: a.safetensors}, id: van-9, path: [[0, 9, 2, 0]]}\n")
+    export.run(ExportConfig(time_s=T, nodes=("van-9",)), "ply", fit, tmp_path / "inserted.ply", edits=script)
+    assert (tmp_path / "inserted.ply").is_file()
+
+
+def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
+    cloud = toy_splats.cloud(40, 2, classes=True)
+    (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud, classes=True))
+    imports.run(ImportConfig(kind="scene", axes="world"), tmp_path / "a.ply", tmp_path / "fit")
+    model = load_model(tmp_path / "fit")
+    assert len(model.table) == 40 and model.sh_degree == 2 and model.nodes[0].kind == "static"
+    again = scenes.splat_scene(model, 0.0).nodes[0].cloud
+    assert (
+        np.array_equal(again.sh, cloud.sh)
+        and cloud.class_ids is not None
+        and np.array_equal(again.class_ids, cloud.class_ids)
+    )
+    with pytest.raises(UsageError, match="settings of objects"):
+        imports.run(ImportConfig(kind="scene", label="car"), tmp_path / "a.ply", tmp_path / "fit2")
+
+
+def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(100, 130, 3000), rng.uniform(-4, 4, 3000), rng.normal(7, 0.01, 3000)])
+    wall = np.column_stack([rng.uniform(100, 130, 300), rng.uniform(3, 4, 300), rng.uniform(7, 12, 300)])
+    means = np.concatenate([ground, wall]).astype(np.float32)
+    cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
+    (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
+    imports.run(ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0)), tmp_path / "a.ply", tmp_path / "street")
+    found = background_of(find_run(tmp_path / "street"), "street")
+    assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
+    pose = geometry.yaw_matrix(0.5, (20, 5, 1))
+    flat = np.stack(np.meshgrid(np.arange(0, 60, 0.4), np.arange(-20, 40, 0.4)), -1).reshape(-1, 2)
+    mine = HeightMap.from_points(np.column_stack([flat, np.full(len(flat), 1.0)]))
+    moves = np.stack([pose @ geometry.yaw_matrix(0.0, (x, 0, 0)) for x in (0.0, 10.0)])
+    placed = place_background(EditWorld({}, Motion.recorded([0.0, 1.0], moves), mine), found)
+    assert np.allclose(placed, geometry.yaw_matrix(0.5, (20, 5, 1 - 7)), atol=0.05)
+
+
+def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="file not found"):
+        imports.run(ImportConfig(), tmp_path / "no.ply", tmp_path / "a.safetensors")
+    (tmp_path / "a.obj").write_bytes(b"v 0 0 0")
+    with pytest.raises(InputError, match="no file of Gaussians"):
+        imports.run(ImportConfig(), tmp_path / "a.obj", tmp_path / "a.safetensors")
+    (tmp_path / "b.ply").write_bytes(
+        formats.ply.to_bytes(replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32)))
+    )
+    with pytest.raises(InputError, match="no solid Gaussians"):
+        imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.safetensors")
+    with pytest.raises(UsageError, match="ends in .safetensors"):
+        imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.ply")
+    assert (
+        cli.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
+    )
+    assert cli.main(["asset", "export", str(tmp_path), "--out", str(tmp_path / "a.safetensors")]) == 2
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+# -- cameras -------------------------------------------------------------------------------------------------------------
+
+
+def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
+    scene = ToyStreet(times=[0.0, 0.1]).write(tmp_path / "scene", width=24, height=12)
+    export.run(ExportConfig(), "nerfstudio", tmp_path / "scene", tmp_path / "out")
+    told = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert len(told["frames"]) == 2
+    for frame, ours in zip(told["frames"], scene.frames, strict=True):
+        assert (tmp_path / "out" / frame["file_path"]).read_bytes() == (
+            tmp_path / "scene" / ours.image.path
+        ).read_bytes()
+        pose = np.array(frame["transform_matrix"])
+        point = ours.view.world_from_cam @ [0.4, 0.3, 5.0, 1.0]
+        x, y, z, _ = np.linalg.inv(pose) @ point  # x right, y up, z back
+        uv = frame["fl_x"] * x / -z + frame["cx"], frame["fl_y"] * -y / -z + frame["cy"]
+        assert np.allclose(uv, geometry.project(ours.view, point[None, :3])[0][0])
+    again = export.run(ExportConfig(), "nerfstudio", tmp_path / "scene", tmp_path / "out")
+    assert again == tmp_path / "out"  # verified and reused
+
+
+def test_colmap_binaries_hold_the_poses_and_one_rig(tmp_path: Path) -> None:
+    scene = ToyStreet(times=[0.0, 0.1, 0.2]).write(tmp_path / "scene", width=24, height=12)
+    aside = geometry.yaw_matrix(0.4, (0.3, 0.5, 0.0))  # a second camera on the rig, 10 ms late at the last frame
+    frames = list(scene.frames)
+    for index, frame in enumerate(scene.frames):
+        late = 0.01 if index == 2 else 0.0
+        pose = scene.ego.pose_at(frame.view.time_s)
+        assert pose is not None
+        cam = pose @ aside @ geometry.invert(pose) @ frame.view.world_from_cam
+        view = View(replace(frame.view.camera, name="left"), cam, frame.view.time_s + late)
+        frames.append(replace(frame, id=frame.id.replace("front", "left"), view=view))
+    both = replace(scene, frames=tuple(frames), cameras={**scene.cameras, "left": frames[-1].view.camera})
+    files = colmap_files(both)
+    sensors = sensors_from_rig(both)
+    assert np.allclose(sensors["front"], np.eye(4))
+    rigs = [len(one.frames) for one in rig_frames(both, sensors)]
+    assert rigs == [2, 2, 1, 1]
+
+    def pose_of(seven: tuple[float, ...]) -> np.ndarray:
+        return geometry.from_rotation_translation(geometry.matrix_from_quaternion(seven[:4]), seven[4:])
+
+    content, place = files["sparse/0/images.bin"], 8
+    found = {}
+    assert struct.unpack_from("<Q", content)[0] == 6
+    for _ in range(6):
+        values = struct.unpack_from("<I7dI", content, place)
+        end = content.index(b"\0", place + 64)
+        assert struct.unpack_from("<Q", content, end + 1) == (0,)
+        found[values[0]] = (pose_of(values[1:8]), values[8], content[place + 64 : end].decode())
+        place = end + 9
+    assert place == len(content)
+    for number, frame in enumerate(both.frames, 1):
+        assert np.abs(found[number][0] - frame.view.cam_from_world).max() < 1e-12
+        assert found[number][2].startswith(frame.id)
+    content = files["sparse/0/frames.bin"]
+    place, explained = 8, {}
+    for _ in range(struct.unpack_from("<Q", content)[0]):
+        values = struct.unpack_from("<II7dI", content, place)
+        place += 68
+        for _ in range(values[9]):
+            kind, sensor, image = struct.unpack_from("<iIQ", content, place)
+            place += 16
+            name = ("front", "left")[sensor - 1]
+            explained[image] = sensors[name] @ pose_of(values[2:9])
+            assert kind == 0
+    assert place == len(content)
+    for image, pose in explained.items():  # what COLMAP makes of rigs and frames are the poses of the images
+        assert np.abs(pose - found[image][0]).max() < 2e-6
+    rig = files["sparse/0/rigs.bin"]
+    assert struct.unpack_from("<QIIiI", rig) == (1, 1, 2, 0, 1)
+    assert struct.unpack_from("<iIB", rig, 24) == (0, 2, 1) and len(rig) == 24 + 9 + 56
+    camera = struct.unpack_from("<IiQQ4d", files["sparse/0/cameras.bin"], 8)
+    assert camera == (1, 1, 24, 12, *both.cameras["front"].intrinsics)
+    text = colmap_files(both, text=True)
+    line = text["sparse/0/images.txt"].decode().splitlines()[0].split()
+    assert np.abs(pose_of(tuple(map(float, line[1:8]))) - found[1][0]).max() < 1e-12
+    assert len(text["sparse/0/rigs.txt"].split()) == 4 + 10
+
+
+def test_starting_points_of_cameras(tmp_path: Path) -> None:
+    from mudg.base.types import PointCloud
+
+    scene = ToyStreet(times=[0.0]).write(tmp_path / "scene", width=24, height=12)
+    points = PointCloud(
+        np.array([[1, 2, 3], [4, 5, 6]], np.float32), np.array([[9, 8, 7], [6, 5, 4]], np.uint8), "world"
+    )
+    content = colmap_files(scene, points)["sparse/0/points3D.bin"]
+    assert (
+        struct.unpack_from("<QQ3d3BdQ", content) == (2, 1, 1.0, 2.0, 3.0, 9, 8, 7, 0.0, 0)
+        and len(content) == 8 + 2 * 51
+    )
+    files = nerfstudio_files(scene, points)
+    assert files["points.ply"].endswith(struct.pack("<3f3B", 4, 5, 6, 6, 5, 4))
+
+
+# -- messages ------------------------------------------------------------------------------------------------------------
+
+
+def records(content: bytes, place: int, end: int):
+    while place < end:
+        code, size = struct.unpack_from("<BQ", content, place)
+        yield place, code, content[place + 9 : place + 9 + size]
+        place += 9 + size
+    assert place == end
+
+
+def text_of(content: bytes, place: int) -> tuple[str, int]:
+    size = struct.unpack_from("<I", content, place)[0]
+    return content[place + 4 : place + 4 + size].decode(), place + 4 + size
+
+
+def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mudg.data.exporters import mcap
+
+    monkeypatch.setattr(mcap, "CHUNK_BYTES", 20_000)  # several chunks
+    street = ToyStreet(times=[0.5, 0.6, 0.7], car_start=(8.0, 1.0), car_velocity=(3.0, 0.0))
+    scene = street.write(tmp_path / "scene", width=24, height=12)
+    assert cli.main(["export", "mcap", str(tmp_path / "scene"), "--out", str(tmp_path / "a.mcap")]) == 0
+    content = (tmp_path / "a.mcap").read_bytes()
+    magic = b"\x89MCAP0\r\n"
+    assert content.startswith(magic) and content.endswith(magic)
+    footer = content[-8 - 29 : -8]
+    code, size, summary, offsets, checksum = struct.unpack("<BQQQI", footer)
+    assert (code, size) == (2, 20) and zlib.crc32(content[summary : len(content) - 12]) == checksum
+    data = list(records(content, 8, summary))
+    assert data[0][1] == 1 and data[-1][1] == 15
+    chunks = {place: body for place, code, body in data if code == 6}
+    channels, times, found = {}, [], {}
+    for body in chunks.values():
+        first, last, size, crc = struct.unpack_from("<QQQI", body)
+        inner = body[28 + 4 + 8 :]
+        assert len(inner) == size and zlib.crc32(inner) == crc
+        for _, code, record in records(inner, 0, size):
+            if code == 4:
+                topic, at = text_of(record, 4)
+                assert text_of(record, at)[0] == "json"
+                channels[struct.unpack_from("<H", record)[0]] = topic
+            if code == 5:
+                channel, _, moment, _ = struct.unpack_from("<HIQQ", record)
+                assert first <= moment <= last
+                times.append(moment)
+                found.setdefault(channels[channel], []).append(json.loads(record[22:]))
+    assert len(chunks) > 2 and times == sorted(times) and times[0] == 0
+    assert {"/tf", "/ego", "/objects", "/camera/front/image", "/camera/front/calibration"} <= set(found)
+    assert [len(found[f"/camera/front/{n}"]) for n in ("image", "calibration")] == [3, 3]
+    picture = base64.b64decode(found["/camera/front/image"][1]["data"])
+    assert picture == (tmp_path / "scene" / scene.frames[1].image.path).read_bytes()
+    sweep = next(value for topic, values in found.items() if topic.startswith("/lidar/") for value in values)
+    assert sweep["point_stride"] == 16 and len(base64.b64decode(sweep["data"])) % 16 == 0
+    assert found["/objects"][1]["entities"][0]["cubes"][0]["size"]["x"] == pytest.approx(4.0)
+    known = {name: set(schema["properties"]) for name, schema in mcap.SCHEMAS.items()}
+    assert set(found["/objects"][0]) == known["foxglove.SceneUpdate"] and set(sweep) == known["foxglove.PointCloud"]
+    statistics = [body for _, code, body in records(content, summary, offsets) if code == 11]
+    assert struct.unpack_from("<QHII", statistics[0])[0] == len(times)
+    for _, code, body in records(content, summary, offsets):
+        if code == 8:  # every entry of a chunk's index leads to a message of its channel and time
+            start, length, size = struct.unpack_from("<QQI", body, 16)
+            inner = chunks[start][40:]
+            for entry in range(0, size, 10):
+                channel, place = struct.unpack_from("<HQ", body, 36 + entry)
+                index = content[place + 9 : place + 9 + struct.unpack_from("<Q", content, place + 1)[0]]
+                for moment, offset in struct.iter_unpack("<QQ", index[6:]):
+                    assert struct.unpack_from("<BQHIQ", inner, offset)[2::2] == (channel, moment)
+            assert content[start] == 6 and length == 9 + len(chunks[start])

@@ -1,0 +1,323 @@
+"""Files of Gaussians: golden bytes, an independent reader for each, round trips within one step of the format."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import splat_readers as slow
+import toy_splats
+from PIL import Image
+
+from mudg.base.errors import InputError, ResourceError
+from mudg.data.splats import binary, bundle, compressed_ply, formats, gltf, ply, sog, splat, spz, usd
+from mudg.data.splats.cloud import SplatCloud, SplatScene, joined
+
+GOLDEN = Path(__file__).parent / "golden" / "splats.json"
+READERS: dict[str, Callable[[bytes], list[slow.Splat]]] = {
+    "ply": slow.read_ply, "compressed-ply": slow.read_compressed, "splat": slow.read_splat, "spz": slow.read_spz, "sog": slow.read_sog,
+    "glb": lambda content: slow.read_glb_mesh(*slow.open_glb(content), 0),
+    "usda": lambda content: slow.read_usd_splats(slow.parse_usda(content.decode())["World"]["scene"]["splats"]),
+}  # fmt: skip
+CASES = [(name, degree) for name in READERS for degree in (0, 1, 2, 3) if degree == 0 or name != "splat"]
+
+
+def content_of(name: str, cloud: SplatCloud) -> bytes:
+    """A cloud as a file of a format, without turning it."""
+    scene = SplatScene("toy", (toy_splats.SplatNode("background", cloud),))
+    return formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0))
+
+
+def as_cloud(splats: list[slow.Splat]) -> SplatCloud:
+    columns = ([s.place for s in splats], [s.turn for s in splats], np.log([s.size for s in splats]), [s.opacity for s in splats],
+               [s.sh for s in splats])  # fmt: skip
+    return SplatCloud(*(np.asarray(values, np.float32) for values in columns))
+
+
+def in_step(splats: SplatCloud, cloud: SplatCloud) -> np.ndarray:
+    """For each Gaussian of ``splats`` the row of ``cloud`` nearest to it: some formats change the order."""
+    found = ((splats.means[:, None] - cloud.means[None]) ** 2).sum(2).argmin(1)
+    assert len(set(found.tolist())) == len(cloud)
+    return found
+
+
+def steps(name: str, cloud: SplatCloud) -> dict[str, np.ndarray | float]:
+    """One step of each value in a format."""
+    exact = 2e-6 * np.abs(cloud.means).max()
+    kinds: dict[str, dict[str, np.ndarray | float]] = {
+        "spz": {"means": 2.0**-12, "scales": 1 / 16, "opacity": 1 / 255, "dc": 1 / (255 * 0.15), "rest": 1 / 8, "turn": 0.004},
+        "splat": {"means": exact, "scales": 1e-5, "opacity": 1 / 255, "dc": 1 / (255 * slow.C0), "rest": 0, "turn": 0.02},
+    }  # fmt: skip
+    span = cloud.means.max(0) - cloud.means.min(0)
+    size = cloud.log_scales.max(0) - cloud.log_scales.min(0)
+    tint = (cloud.sh[:, 0].max(0) - cloud.sh[:, 0].min(0)) / 255
+    kinds["compressed-ply"] = {"means": span / np.array([2047, 1023, 2047]), "scales": size / 1023, "opacity": 1 / 255, "dc": tint + 1e-5,
+                               "rest": 8 / 256, "turn": 0.004}  # fmt: skip
+    log_span = np.sign(cloud.means) * np.log1p(np.abs(cloud.means))
+    grown = (1 + np.abs(cloud.means).max()) * (log_span.max(0) - log_span.min(0)) / 65535
+    rough = 0.06 if len(cloud) > 256 else 1e-5  # tables are fine where many values are, and coarse at their ends
+    kinds["sog"] = {
+        "means": grown + exact,
+        "scales": rough * 2,
+        "opacity": 1 / 255,
+        "dc": rough,
+        "rest": rough * 3,
+        "turn": 0.02,
+    }
+    plain = {"means": exact, "scales": 1e-5, "opacity": 1e-5, "dc": 1e-5, "rest": 1e-5, "turn": 1e-5}
+    return kinds.get(name, plain)
+
+
+def assert_close(
+    found: SplatCloud, cloud: SplatCloud, limits: dict[str, np.ndarray | float], activated: bool = False
+) -> None:
+    rows = cloud.take(in_step(found, cloud))
+    assert (np.abs(found.means - rows.means) <= limits["means"]).all()
+    assert (np.abs(found.log_scales - rows.log_scales) <= limits["scales"]).all()
+    opacity = found.logits if activated else found.opacity
+    assert (np.abs(opacity - rows.opacity) <= limits["opacity"]).all()
+    assert (np.abs(found.sh[:, 0] - rows.sh[:, 0]) <= limits["dc"]).all()
+    assert found.sh.shape == rows.sh.shape and (np.abs(found.sh[:, 1:] - rows.sh[:, 1:]) <= limits["rest"]).all()
+    agreement = np.abs((found.quats / np.linalg.norm(found.quats, axis=1, keepdims=True) * rows.quats).sum(1))
+    assert (1 - agreement <= np.asarray(limits["turn"]) ** 2 + 1e-6).all()
+
+
+@pytest.mark.parametrize(("name", "degree"), CASES)
+def test_an_independent_reader_finds_what_was_written(name: str, degree: int) -> None:
+    cloud = toy_splats.cloud(5, degree)
+    assert_close(as_cloud(READERS[name](content_of(name, cloud))), cloud, steps(name, cloud), activated=True)
+
+
+@pytest.mark.parametrize(("name", "degree"), [case for case in CASES if case[0] != "usda"])
+def test_what_is_read_back_differs_by_at_most_one_step(name: str, degree: int) -> None:
+    cloud = toy_splats.cloud(700, degree, 4)
+    content = content_of(name, cloud)
+    assert formats.format_of(content, f"x.{name}") == name
+    found, _ = formats.read_cloud(content, f"x.{name}", "world")
+    limits = steps(name, cloud)
+    if name == "compressed-ply":  # chunks of their own bounds: never coarser than those of all
+        limits |= {"means": np.asarray(limits["means"]) + 1e-5}
+    if name == "sog" and degree:  # the palette is as fine as there are Gaussians, its table is not
+        limits |= {"rest": 0.1}
+    assert_close(found, cloud, limits)
+    assert content_of(name, cloud) == content
+
+
+def rounded(content: bytes) -> str:
+    """JSON text with 9 digits a number: the last ones depend on the processor."""
+    return re.sub(r"-?\d+\.\d+(e-?\d+)?", lambda found: f"{float(found[0]):.9g}", content.decode())
+
+
+def test_golden_bytes_of_three_gaussians() -> None:
+    cloud = toy_splats.cloud(3, 1, 11)
+    made: dict[str, object] = {
+        "ply": ply.to_bytes(cloud).hex(), "compressed-ply": compressed_ply.to_bytes(cloud).hex(),
+        "splat": splat.to_bytes(cloud.of_degree(0)).hex(), "spz": zlib.decompress(spz.to_bytes(cloud), 31).hex(),
+        "glb": content_of("glb", cloud).hex(), "usda": content_of("usda", cloud).decode(),
+    }  # fmt: skip
+    archive = zipfile.ZipFile(io.BytesIO(sog.to_bytes(cloud)))
+    pictures = {
+        n: np.asarray(Image.open(io.BytesIO(archive.read(n)))).tobytes().hex()
+        for n in archive.namelist()
+        if n.endswith("webp")
+    }
+    files = zipfile.ZipFile(io.BytesIO(bundle.to_bytes(toy_splats.scene(0, 1))))
+    made["bundle"] = {
+        name: rounded(files.read(name)) if name.endswith("json") else files.read(name).hex()
+        for name in files.namelist() if name != "sky.png"
+    }  # fmt: skip
+    made["sog"] = {"meta.json": rounded(archive.read("meta.json")), **pictures}
+    if os.environ.get("MUDG_UPDATE_FROZEN"):
+        GOLDEN.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+    wanted = json.loads(GOLDEN.read_text(encoding="utf-8"))
+    assert made == wanted
+
+
+@pytest.mark.parametrize("name", [name for name, one in formats.FORMATS.items() if one.read])
+@pytest.mark.parametrize("axes", ["viewer", "world"])
+def test_axes_come_back_and_are_those_of_the_format(name: str, axes: formats.Axes) -> None:
+    cloud = toy_splats.cloud(20, 0 if name == "splat" else 2, 8)
+    scene = SplatScene("toy", (toy_splats.SplatNode("background", cloud),), formats.file_from_world(name, axes))
+    content = formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0))
+    found, _ = formats.read_cloud(content, f"x.{name}", axes)
+    assert np.abs(found.means - cloud.means[in_step(found, cloud)]).max() < 0.05
+    up = formats.file_from_world(name, "viewer")[:3, :3] @ [0, 0, 1]
+    assert up.tolist() == ([0, -1, 0] if formats.FORMATS[name].axes.startswith("right, down") else [0, 1, 0])
+
+
+def test_a_turned_cloud_looks_as_from_the_other_side() -> None:
+    cloud, pose = toy_splats.cloud(6, 3, 2), toy_splats.geometry.yaw_matrix(0.8, (1, 2, 3))
+    moved = cloud.moved(pose)
+    d = toy_splats.np.random.default_rng(0).normal(size=(9, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    from mudg.core.sh import basis
+
+    before, after = (
+        np.einsum("dk,nkc->dnc", basis(rays, 3), sh) for rays, sh in ((d, cloud.sh), (d @ pose[:3, :3].T, moved.sh))
+    )
+    assert np.abs(before - after).max() < 1e-5
+    assert np.abs(moved.moved(np.linalg.inv(pose)).means - cloud.means).max() < 1e-5
+
+
+def test_joining_takes_the_highest_degree_and_keeps_classes() -> None:
+    both = joined([toy_splats.cloud(2, 1, classes=True), toy_splats.cloud(3, 2)])
+    assert both.degree == 2 and both.class_ids is not None and both.class_ids[2:].tolist() == [255] * 3
+    assert not both.sh[:2, 4:].any()
+
+
+# -- particular formats --------------------------------------------------------------------------------------------------
+
+
+def test_the_ply_keeps_the_order_that_readers_by_position_expect() -> None:
+    cloud = toy_splats.cloud(4, 3, classes=True)
+    content = ply.to_bytes(cloud, classes=True)
+    names = [line.split()[-1] for line in content.partition(b"end_header")[0].decode().splitlines()[3:]]
+    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
+    assert names[54:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "class"]
+    back = ply.from_bytes(content, "x")
+    assert back.class_ids is not None and cloud.class_ids is not None and (back.class_ids == cloud.class_ids).all()
+    assert (
+        np.array_equal(back.means, cloud.means)
+        and np.array_equal(back.sh, cloud.sh)
+        and np.array_equal(back.logits, cloud.logits)
+    )
+
+
+def test_a_ply_with_other_columns_types_and_order_of_bytes_is_read() -> None:
+    names = "rot_3 rot_2 rot_1 rot_0 scale_0 scale_1 scale_2 opacity f_dc_0 f_dc_1 f_dc_2 z y x".split()
+    rows = np.zeros(2, [("red", ">u1"), *((name, ">f8") for name in names)])
+    rows["rot_0"], rows["x"], rows["z"] = 2, (1, 2), (3, 4)
+    lines = ["ply", "format binary_big_endian 1.0", "comment made elsewhere", "element vertex 2", "property uchar red"]
+    lines += [f"property double {name}" for name in names] + ["end_header"]
+    cloud = ply.from_bytes(("\r\n".join(lines) + "\r\n").encode() + rows.tobytes(), "x")
+    assert cloud.means.tolist() == [[1, 0, 3], [2, 0, 4]] and cloud.quats.tolist() == [[1, 0, 0, 0]] * 2
+
+
+def test_opacities_of_0_and_1_and_sizes_of_0_are_read() -> None:
+    """Other programs write their logits and logarithms as infinities."""
+    cloud = toy_splats.cloud(3)
+    sizes = cloud.log_scales.copy()
+    sizes[2, 1] = -np.inf
+    ends = SplatCloud(cloud.means, cloud.quats, sizes, np.array([-np.inf, np.inf, 0], np.float32), cloud.sh)
+    found = ply.from_bytes(ply.to_bytes(ends), "x")
+    assert found.opacity[0] < 1e-5 and found.opacity[1] > 0.9999 and found.log_scales[2, 1] == -40
+    assert np.isfinite(found.logits).all()
+
+
+def test_spz_takes_fewer_fractional_bits_for_far_places() -> None:
+    cloud = toy_splats.cloud(5, spread=5000.0)
+    assert spz.fractional_bits(cloud.means) == 10
+    assert np.abs(spz.from_bytes(spz.to_bytes(cloud), "x").means - cloud.means).max() <= 2**-10
+    far = SplatCloud(cloud.means * 1e4, cloud.quats, cloud.log_scales, cloud.logits, cloud.sh)
+    with pytest.raises(InputError, match="too far"):
+        spz.to_bytes(far)
+
+
+def test_spz_of_version_2_is_read() -> None:
+    cloud = toy_splats.cloud(40, 0, 5)
+    raw = bytearray(zlib.decompress(spz.to_bytes(cloud), 31))
+    raw[4] = 2
+    xyz = np.round(cloud.quats[:, 1:] * np.where(cloud.quats[:, :1] < 0, -1, 1) * 127.5 + 127.5).astype(np.uint8)
+    found = spz.from_bytes(binary.gzip_bytes(bytes(raw[: 16 + 16 * 40]) + xyz.tobytes()), "x")
+    assert (1 - np.abs((found.quats * cloud.quats).sum(1))).max() < 4e-3  # 8 bits; the worst where w is small
+
+
+def test_spz_of_version_4_needs_a_package() -> None:
+    cloud = toy_splats.cloud(5, 1)
+    if _has_zstandard():
+        assert_close(spz.from_bytes(spz.to_bytes(cloud, 4), "x"), cloud, steps("spz", cloud))
+        return
+    with pytest.raises(ResourceError, match="zstandard"):
+        spz.to_bytes(cloud, 4)
+
+
+def _has_zstandard() -> bool:
+    import importlib.util
+
+    return importlib.util.find_spec("zstandard") is not None
+
+
+def test_the_bundle_holds_everything() -> None:
+    scene = toy_splats.scene(1)
+    archive = zipfile.ZipFile(io.BytesIO(bundle.to_bytes(scene)))
+    assert all(info.compress_type == zipfile.ZIP_STORED for info in archive.infolist())
+    about, tracks = (json.loads(archive.read(name)) for name in ("bundle.json", "tracks.json"))
+    assert [node["name"] for node in about["nodes"]] == ["background", "car-1", "1 person"]
+    assert tracks["schema"] == "splatsim.sequence_tracks/v2" and [t["track_id"] for t in tracks["tracks"]] == [
+        "car-1",
+        "1 person",
+    ]
+    frame = tracks["tracks"][0]["frames"][1]
+    assert frame["timestamp_us"] == 250_000 and frame["translation"] == [1.0, 1.0, 0.8]
+    assert np.allclose(frame["rotation"], [0, 0, np.sin(0.3), np.cos(0.3)])
+    from safetensors.numpy import load
+
+    for node, kept in zip(scene.nodes, about["nodes"], strict=True):
+        assert_close(as_cloud(slow.read_ply(archive.read(kept["file"]))),
+                     node.cloud, steps("ply", node.cloud), activated=True)  # fmt: skip
+    moved = load(archive.read(about["nodes"][2]["deform"]))["displacement"]
+    assert scene.nodes[2].displacement is not None and np.array_equal(moved, scene.nodes[2].displacement)
+    sky = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))
+    assert scene.sky is not None and np.array_equal(sky, scene.sky)
+
+
+def test_zips_are_aligned_and_the_same_each_time() -> None:
+    files = {"a.usda": b"x" * 100, "a name.png": b"y" * 7, "b" * 61: b"z" * 64}
+    content = binary.stored_zip(files, align=64)
+    archive = zipfile.ZipFile(io.BytesIO(content))
+    assert archive.testzip() is None and {n: archive.read(n) for n in archive.namelist()} == files
+    for info in archive.infolist():
+        name, extra = (int.from_bytes(content[info.header_offset + at :][:2], "little") for at in (26, 28))
+        assert (info.header_offset + 30 + name + extra) % 64 == 0
+    assert binary.stored_zip(files, align=64) == content
+
+
+def test_morton_order_keeps_neighbours_together() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    mixed = grid[np.random.default_rng(0).permutation(len(grid))]
+    ordered = mixed[binary.morton_order(mixed)]
+    assert all((np.ptp(ordered[i : i + 8], axis=0) == 1).all() for i in range(0, 512, 8))
+
+
+def test_what_is_lost_is_said() -> None:
+    scene = toy_splats.scene(2)
+
+    def lost(name: str, time_s: float | None) -> str:
+        return "; ".join(formats.losses(name, formats.WriteRequest(scene, time_s)))
+
+    assert lost("bundle", None) == "" and lost("usdz", None) == ""
+    assert lost("usda", None).startswith("the sky")
+    assert lost("glb", None).startswith("deformation (1 person in the shape of the middle")
+    assert "motion (2 objects as at 0.5 s)" in lost("ply", 0.5)
+    assert "colours that depend" in lost("splat", 0.5) and "classes" in lost("spz", 0.5)
+
+
+def test_a_fit_that_draws_antialiased_says_so_where_it_can() -> None:
+    scene = toy_splats.scene()
+    request = formats.WriteRequest(SplatScene("toy", scene.nodes, facts={"drawing": {"antialias": True}}), 0.5)
+    assert zlib.decompress(formats.FORMATS["spz"].write(request), 31)[14] == 1
+    assert (
+        json.loads(zipfile.ZipFile(io.BytesIO(formats.FORMATS["sog"].write(request))).read("meta.json"))["antialias"]
+        is True
+    )
+    assert formats.losses("ply", request)[-1] == "how the fit draws Gaussians (antialias True)"
+    assert not any("draws" in sentence for sentence in formats.losses("spz", request))
+
+
+def test_names_of_prims_and_files_are_valid_and_differ() -> None:
+    assert usd.prim_names(["a-1", "a_1", "7", ""]) == ["a_1", "a_1_2", "_7", "node"]
+    assert bundle.file_names(["a/b", "A_b", ".."]) == ["a_b", "A_b_2", "node"]
+
+
+def test_times_of_animations_rise_and_are_not_negative() -> None:
+    made = gltf.rising(np.array([-0.1, 0.0, 1e-50, 5.0, 5.0 + 1e-9]))
+    assert (np.diff(made) > 0).all() and made[0] == 0

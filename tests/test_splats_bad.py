@@ -1,0 +1,274 @@
+"""Files of Gaussians that are damaged: every length, every byte of the header, values that are no numbers, bombs. Always a clear error."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import toy_splats
+
+from mudg.base.errors import InputError, MudgError
+from mudg.data.splats import binary, formats, gltf, ply, sog, splat, spz
+from mudg.data.splats.cloud import SplatCloud
+
+READ = [name for name, one in formats.FORMATS.items() if one.read]
+NOT_STATED = {"splat": 32}
+"""Formats without a header: a file that was cut off after a whole Gaussian is a shorter file."""
+
+
+def content_of(name: str, degree: int = 1) -> bytes:
+    scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", toy_splats.cloud(3, degree)),))
+    return formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0))
+
+
+def read(content: bytes, name: str) -> SplatCloud:
+    """Read by the format's own reader; anything but an error of ours and a sound cloud is a failure."""
+    reader = formats.FORMATS[name].read
+    assert reader is not None
+    cloud = reader(content, "bad.file")
+    assert np.isfinite(cloud.means).all() and np.isfinite(cloud.log_scales).all() and np.isfinite(cloud.sh).all()
+    return cloud
+
+
+@pytest.mark.parametrize("name", READ)
+def test_every_length_short_of_the_whole_is_refused(name: str) -> None:
+    content = content_of(name)
+    last = max(len(content) - 60, 600)
+    for length in (*range(min(600, len(content))), *range(600, last, 37), *range(last, len(content))):
+        if length and length % NOT_STATED.get(name, len(content) + 1) == 0:
+            continue
+        with pytest.raises(MudgError) as caught:
+            read(content[:length], name)
+        assert "bad.file" in str(caught.value), str(caught.value)
+
+
+@pytest.mark.parametrize("name", READ)
+def test_every_flipped_byte_is_read_or_refused_in_words(name: str) -> None:
+    content = content_of(name, 0)
+    places = range(0, min(len(content), 700), 3 if name in ("sog", "glb") else 1)
+    refused = 0
+    for place in places:
+        for flip in (0x01, 0x80, 0xFF):
+            bad = bytearray(content)
+            bad[place] ^= flip
+            try:
+                read(bytes(bad), name)
+            except MudgError as error:
+                refused += "bad.file" in str(error)
+    assert refused or name == "splat"
+
+
+@pytest.mark.parametrize("name", READ)
+@pytest.mark.parametrize(
+    "content", [b"", b"p", b"ply\n", b"\x1f\x8b", b"NGSP", b"glTF", b"PK\x03\x04", b"\0" * 4095, b"\xff" * 333]
+)
+def test_what_is_another_file_is_refused(name: str, content: bytes) -> None:
+    with pytest.raises(InputError, match="where: bad.file"):
+        read(content, name)
+
+
+def test_an_unknown_file_lists_what_is_read() -> None:
+    with pytest.raises(InputError, match=r"\.glb, \.ply, \.sog, \.splat, \.spz"):
+        formats.read_cloud(b"hello", "a.obj")
+
+
+# -- numbers -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", range(17))
+def test_values_of_a_ply_that_are_no_numbers_are_refused(value: float, column: int) -> None:
+    nothing = np.isneginf(value) and 10 <= column < 13  # a size of 0
+    if 3 <= column < 6 or nothing or (column == 9 and np.isinf(value)):  # normals are not read, opacities may be 0 or 1
+        return
+    content = ply.to_bytes(toy_splats.cloud(3))
+    at = content.index(b"end_header\n") + 11 + 4 * 17
+    bad = content[: at + 4 * column] + struct.pack("<f", value) + content[at + 4 * column + 4 :]
+    with pytest.raises(InputError, match=r"bad.file: Gaussian 1"):
+        read(bad, "ply")
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "3.5", "99999999999", "5000000", "1" * 40, "three"])
+@pytest.mark.parametrize("name", ["ply", "compressed-ply"])
+def test_impossible_counts_of_a_ply_are_refused_at_once(name: str, count: str) -> None:
+    bad = content_of(name).replace(b"element vertex 3", b"element vertex " + count.encode())
+    with within(1 << 20), pytest.raises(InputError, match="bad.file"):
+        read(bad, name)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"), [(4, 1), (4, 9), (8, 0), (8, 0xFFFFFFFF), (8, 40_000_000), (12, 4), (13, 60)]
+)
+def test_headers_of_spz_that_cannot_be_are_refused(place: int, value: int) -> None:
+    raw = bytearray(zlib.decompress(spz.to_bytes(toy_splats.cloud(3)), 31))
+    raw[place : place + (4 if place < 12 else 1)] = value.to_bytes(4 if place < 12 else 1, "little")
+    with within(1 << 21), pytest.raises(InputError, match="bad.file"):
+        read(binary.gzip_bytes(bytes(raw)), "spz")
+
+
+def test_spz_that_goes_on_or_has_a_wrong_checksum_is_refused() -> None:
+    content = spz.to_bytes(toy_splats.cloud(3))
+    raw = zlib.decompress(content, 31)
+    with pytest.raises(InputError, match="goes on"):
+        read(binary.gzip_bytes(raw + b"x"), "spz")
+    with pytest.raises(InputError, match="damaged"):
+        read(content[:-8] + bytes(4) + content[-4:], "spz")
+
+
+def test_spz_of_version_4_with_a_wrong_table_is_refused_before_the_package_is_needed() -> None:
+    head = struct.pack("<IIIBBBBI12x", spz.MAGIC, 4, 3, 0, 12, 0, 9, 32)
+    with pytest.raises(InputError, match="does not fit"):
+        read(head + bytes(200), "spz")
+
+
+# -- bombs ---------------------------------------------------------------------------------------------------------------
+
+
+class within:
+    """Fails if the block takes more memory than this (Python's and numpy's)."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+
+    def __enter__(self) -> None:
+        tracemalloc.start()
+
+    def __exit__(self, *problem: Any) -> None:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < self.most, f"{peak} bytes"
+
+
+def test_a_gzip_bomb_is_not_inflated_beyond_what_its_header_says() -> None:
+    head = struct.pack(spz.HEADER, spz.MAGIC, 3, 10, 0, 12, 0, 0)
+    bomb = binary.gzip_bytes(head + bytes(12 << 20))
+    with within(4 << 20), pytest.raises(InputError, match="goes on"):
+        read(bomb, "spz")
+
+
+@pytest.mark.parametrize("name", ["spz", "sog"])
+def test_more_gaussians_than_a_file_can_hold_are_refused_before_anything_is_inflated(name: str) -> None:
+    raw = struct.pack(spz.HEADER, spz.MAGIC, 3, 200_000, 0, 12, 0, 0) + bytes(19 * 200_000)
+    with within(3 << 20), pytest.raises(InputError, match="than a file of this size"):
+        read(binary.gzip_bytes(raw) if name == "spz" else altered_sog(lambda meta: meta.update(count=20_000_000)), name)
+
+
+def test_a_zip_bomb_is_not_inflated() -> None:
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("meta.json", b" " * (12 << 20))
+    with within(8 << 20), pytest.raises(InputError, match="too large"):
+        read(target.getvalue(), "sog")
+
+
+def altered_sog(change: Callable[[dict[str, Any]], None], files: dict[str, bytes] | None = None) -> bytes:
+    archive = zipfile.ZipFile(io.BytesIO(sog.to_bytes(toy_splats.cloud(3, 1))))
+    kept = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(kept["meta.json"])
+    change(meta)
+    return binary.stored_zip({**kept, "meta.json": json.dumps(meta).encode(), **(files or {})})
+
+
+def huge_webp() -> bytes:
+    target = io.BytesIO()
+    sog.Image.new("RGBA", (1024, 1024)).save(target, "WEBP", lossless=True)
+    return target.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda meta: meta.update(count=70_000), "impossible size"),
+        (lambda meta: meta.update(count=0), "count"),
+        (lambda meta: meta.update(version=1), "version"),
+        (lambda meta: meta["means"].update(mins=[0, 0]), "mins"),
+        (lambda meta: meta["means"].update(maxs=[0, 0, 1e9]), "bad.file"),
+        (lambda meta: meta["scales"].update(codebook=[0.0] * 255), "codebook"),
+        (lambda meta: meta["scales"].update(codebook=[1e9] * 256), "too far"),
+        (lambda meta: meta["sh0"].update(files=["../../etc/passwd"]), "missing"),
+        (lambda meta: meta["shN"].update(count=65536), "impossible size"),
+        (lambda meta: meta["shN"].update(bands=3), "impossible size"),
+        (lambda meta: meta["quats"].update(files=["sh0.webp"]), "names no component"),
+        (lambda meta: meta.update(more=1), "unknown field"),
+    ],
+)
+def test_meta_of_sog_that_cannot_be_is_refused(change: Callable[[dict[str, Any]], None], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read(altered_sog(change), "sog")
+
+
+def test_a_picture_bomb_is_refused_before_it_is_unpacked() -> None:
+    bad = altered_sog(lambda meta: None, {"sh0.webp": huge_webp()})
+    with within(4 << 20), pytest.raises(InputError, match="impossible size"):
+        read(bad, "sog")
+
+
+# -- glTF ----------------------------------------------------------------------------------------------------------------
+
+
+def altered_glb(change: Callable[[dict[str, Any]], Any]) -> bytes:
+    content = content_of("glb")
+    size = int.from_bytes(content[12:16], "little")
+    document = json.loads(content[20 : 20 + size])
+    change(document)
+    return gltf.glb(document, content[28 + size :])
+
+
+def set_rotation(document: dict[str, Any], **values: Any) -> None:
+    document["accessors"][
+        document["meshes"][0]["primitives"][0]["attributes"]["KHR_gaussian_splatting:ROTATION"]
+    ].update(values)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d.update(meshes=3), "no list"),
+        (lambda d: d["nodes"][0].update(mesh=7), "names nothing"),
+        (lambda d: d["nodes"][0].update(mesh=-1), "names nothing"),
+        (lambda d: d["nodes"][0].update(children=[0]), "no tree"),
+        (lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "no quaternion"),
+        (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "unevenly"),
+        (lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "unevenly"),
+        (lambda d: d["nodes"][0].update(translation=["a", 0, 0]), "no list of 3"),
+        (lambda d: d["nodes"][0].update(translation=[10**400, 0, 0]), "too large"),
+        (lambda d: d["scenes"][0].update(nodes=[0] * 100), "no tree"),
+        (lambda d: set_rotation(d, count=10**9), "not possible"),
+        (lambda d: set_rotation(d, count=4), "beyond|differ"),
+        (lambda d: set_rotation(d, count=2), "differ"),
+        (lambda d: set_rotation(d, type="VEC3"), "wrong type"),
+        (lambda d: set_rotation(d, componentType=5125), "wrong type"),
+        (lambda d: set_rotation(d, byteOffset=-4), "no size"),
+        (lambda d: set_rotation(d, byteOffset=10**9), "beyond"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=10**9), "beyond"),
+        (lambda d: d["bufferViews"][0].update(byteStride=4), "beyond"),
+        (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no Gaussians"),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"),
+            "degree out",
+        ),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2"),
+            "missing",
+        ),
+        (lambda d: d.update(nodes=d["nodes"] * 400, scenes=[{"nodes": list(range(400))}]), "too often"),
+    ],
+)
+def test_documents_of_glb_that_cannot_be_are_refused(change: Callable[[dict[str, Any]], Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read(altered_glb(change), "glb")
+
+
+def test_places_of_a_splat_file_that_are_no_numbers_are_refused() -> None:
+    content = bytearray(splat.to_bytes(toy_splats.cloud(2)))
+    content[32:36] = struct.pack("<f", np.nan)
+    with pytest.raises(InputError, match="Gaussian 1"):
+        read(bytes(content), "splat")

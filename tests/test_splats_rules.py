@@ -1,0 +1,284 @@
+"""Rules of glTF with KHR_gaussian_splatting and of USD with ParticleField3DGaussianSplat, checked as validators do; motion in both."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import splat_readers as slow
+import toy_splats
+from PIL import Image
+from toy_scene import ToyStreet
+
+from mudg.base import geometry
+from mudg.data.splats import gltf, usd
+from mudg.data.splats.cloud import SplatCloud, SplatScene
+from mudg.data.splats.formats import file_from_world
+
+PREFIX = "KHR_gaussian_splatting:"
+
+
+def moment(scene: SplatScene, time_s: float) -> np.ndarray:
+    """Places of all Gaussians at a time, sorted, in the axes of the file."""
+    return ordered(scene.at(time_s).means)
+
+
+def ordered(places: np.ndarray) -> np.ndarray:
+    return np.asarray(places)[np.lexsort(np.round(np.asarray(places, np.float64), 3).T)]
+
+
+def posed(cloud: list[slow.Splat], translation: np.ndarray, wxyz: np.ndarray) -> np.ndarray:
+    pose = geometry.from_rotation_translation(geometry.matrix_from_quaternion(wxyz), translation)
+    return geometry.transform_points(pose, np.array([s.place for s in cloud]))
+
+
+def at_time(times: list[float], values: np.ndarray, time_s: float, turns: bool = False) -> np.ndarray:
+    """What players make of keys: linear, or slerp for quaternions; the first and last value beyond them."""
+    after = int(np.clip(np.searchsorted(times, time_s), 1, len(times) - 1))
+    u = float(np.clip((time_s - times[after - 1]) / (times[after] - times[after - 1]), 0, 1))
+    a, b = values[after - 1], values[after]
+    return geometry.slerp(a, b, u) if turns else (1 - u) * a + u * b
+
+
+# -- glTF ----------------------------------------------------------------------------------------------------------------
+
+
+def gltf_problems(content: bytes) -> list[str]:
+    """What a validator would say of a GLB file."""
+    document, data = slow.open_glb(content)
+    found = []
+    if document["asset"]["version"] != "2.0" or "KHR_gaussian_splatting" not in document["extensionsUsed"]:
+        found.append("asset or extensionsUsed")
+    if document["buffers"] != [{"byteLength": len(data) - (-document["buffers"][0]["byteLength"] % 4)}]:
+        found.append("buffer length")
+    ends = 0
+    for view in document["bufferViews"]:
+        found += ["views overlap"] if view["byteOffset"] < ends else []
+        ends = view["byteOffset"] + view["byteLength"]
+    found += ["view beyond buffer"] if ends > len(data) else []
+    used = {index for mesh in document["meshes"] for p in mesh["primitives"] for index in p["attributes"].values()}
+    used |= {s[side] for a in document.get("animations", []) for s in a["samplers"] for side in ("input", "output")}
+    found += ["unused accessor"] if used != set(range(len(document["accessors"]))) else []
+    for mesh in document["meshes"]:
+        for primitive in mesh["primitives"]:
+            found += primitive_problems(document, data, primitive)
+    for animation in document.get("animations", []):
+        found += animation_problems(document, data, animation)
+    for node in document["nodes"]:
+        found += ["node rotation"] if abs(np.linalg.norm(node.get("rotation", [0, 0, 0, 1])) - 1) > 1e-6 else []
+        found += ["node scale"] if min(node.get("scale", [1])) <= 0 else []
+    return found
+
+
+def primitive_problems(document: dict[str, Any], data: bytes, primitive: dict[str, Any]) -> list[str]:
+    found, attributes = [], primitive["attributes"]
+    kind = primitive["extensions"]["KHR_gaussian_splatting"]
+    if (
+        primitive["mode"] != 0
+        or kind["kernel"] != "ellipse"
+        or kind["colorSpace"] not in ("srgb_rec709_display", "lin_rec709_display")
+    ):
+        found.append("primitive")
+    values = {name: np.array(slow.accessor(document, data, index)) for name, index in attributes.items()}
+    counts = {len(rows) for rows in values.values()}
+    found += ["counts"] if len(counts) != 1 else []
+    place = document["accessors"][attributes["POSITION"]]
+    exact = np.array([place["min"], place["max"]], np.float32)
+    if not np.array_equal(exact, np.array([values["POSITION"].min(0), values["POSITION"].max(0)], np.float32)):
+        found.append("bounds of positions")
+    found += ["rotation"] if np.abs(np.linalg.norm(values[PREFIX + "ROTATION"], axis=1) - 1).max() > 1e-5 else []
+    found += ["scale"] if (values[PREFIX + "SCALE"] <= 0).any() else []
+    for name in (PREFIX + "OPACITY", "COLOR_0"):
+        found += [name] if (values[name] < 0).any() or (values[name] > 1).any() else []
+    bands = {name for name in attributes if name.startswith(PREFIX + "SH_")}
+    degree = int(np.sqrt(len(bands))) - 1
+    if bands != {f"{PREFIX}SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)}:
+        found.append("harmonics")
+    return found
+
+
+def animation_problems(document: dict[str, Any], data: bytes, animation: dict[str, Any]) -> list[str]:
+    found, targets = [], [(c["target"]["node"], c["target"]["path"]) for c in animation["channels"]]
+    found += ["a target twice"] if len(set(targets)) != len(targets) else []
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        times = np.array(slow.accessor(document, data, sampler["input"]))[:, 0]
+        given, values = (
+            document["accessors"][sampler["input"]],
+            np.array(slow.accessor(document, data, sampler["output"])),
+        )
+        found += ["times"] if times[0] < 0 or (np.diff(times) <= 0).any() else []
+        found += ["bounds of times"] if [given["min"][0], given["max"][0]] != [times[0], times[-1]] else []
+        found += ["keys"] if len(values) != len(times) else []
+        if channel["target"]["path"] == "rotation":
+            found += ["rotations"] if np.abs(np.linalg.norm(values, axis=1) - 1).max() > 1e-6 else []
+        if channel["target"]["path"] == "scale":
+            found += ["scales"] if (values <= 0).any() or sampler["interpolation"] != "STEP" else []
+    return found
+
+
+@pytest.mark.parametrize(("degree", "time_s"), [(0, None), (2, None), (3, 0.5)])
+def test_a_glb_keeps_the_rules(degree: int, time_s: float | None) -> None:
+    scene = replace(toy_splats.scene(degree), file_from_world=file_from_world("glb", "viewer"))
+    assert gltf_problems(gltf.to_bytes(scene, time_s)) == []
+
+
+@pytest.mark.parametrize("time_s", [-0.5, -0.1, 0.25, 0.4, 0.9, 1.0])
+def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
+    scene = replace(toy_splats.scene(), file_from_world=file_from_world("glb", "viewer"))
+    stiff = replace(
+        scene,
+        nodes=(*scene.nodes[:2], replace(scene.nodes[2], cloud=gltf.middle_shape(scene.nodes[2]), displacement=None)),
+    )
+    document, data = slow.open_glb(gltf.to_bytes(scene))
+    played = {(c["target"]["node"], c["target"]["path"]): document["animations"][0]["samplers"][c["sampler"]]
+              for c in document["animations"][0]["channels"]}  # fmt: skip
+    shown = []
+    for index, node in enumerate(document["nodes"]):
+        cloud = slow.read_glb_mesh(document, data, node["mesh"])
+        now: dict[str, np.ndarray] = {
+            "translation": np.zeros(3),
+            "rotation": np.array([0, 0, 0, 1.0]),
+            "scale": np.ones(3),
+        }
+        for path in now:
+            if (index, path) in played:
+                sampler = played[index, path]
+                times, values = (np.array(slow.accessor(document, data, sampler[side])) for side in ("input", "output"))
+                if path == "scale":
+                    now[path] = values[max(0, int(np.searchsorted(times[:, 0], time_s + 0.5 + 1e-9, "right")) - 1)]
+                else:
+                    now[path] = at_time(times[:, 0].tolist(), values, time_s + 0.5, path == "rotation")
+        if now["scale"][0] == 1:
+            shown.append(posed(cloud, now["translation"], now["rotation"][[3, 0, 1, 2]]))
+    assert np.abs(ordered(np.concatenate(shown)) - moment(stiff, time_s)).max() < 1e-4
+
+
+# -- USD -----------------------------------------------------------------------------------------------------------------
+
+
+def usd_problems(prim: dict[str, Any]) -> list[str]:
+    """What NVIDIA's and our rules say of a field of particles."""
+    found = []
+    count = len(prim["orientations"])
+    degree = prim["radiance:sphericalHarmonicsDegree"]
+    places = list(prim["positions"].values()) if isinstance(prim["positions"], dict) else [prim["positions"]]
+    if {len(prim[name]) for name in ("scales", "opacities")} | {len(place) for place in places} != {count}:
+        found.append("lengths")
+    if len(prim["radiance:sphericalHarmonicsCoefficients"]) != count * (degree + 1) ** 2:
+        found.append("harmonics")
+    if prim["_metadata"] != {"elementSize": str((degree + 1) ** 2)}:
+        found.append("elementSize")
+    found += ["orientations"] if np.abs(np.linalg.norm(prim["orientations"], axis=1) - 1).max() > 1e-5 else []
+    found += ["scales"] if np.min(prim["scales"]) <= 0 else []
+    found += ["opacities"] if np.min(prim["opacities"]) < 0 or np.max(prim["opacities"]) > 1 else []
+    low, high = np.array(prim["extent"])
+    reach = 3 * np.max(prim["scales"], 1)[:, None]
+    for place in np.array(places):
+        found += ["extent"] if (place - reach < low - 1e-4).any() or (place + reach > high + 1e-4).any() else []
+    found += (
+        ["hints"] if (prim["projectionModeHint"], prim["sortingModeHint"]) != ("perspective", "cameraDistance") else []
+    )
+    return found
+
+
+@pytest.mark.parametrize(("degree", "time_s"), [(0, None), (3, None), (1, 0.5)])
+def test_usd_keeps_the_rules(degree: int, time_s: float | None) -> None:
+    stage = slow.parse_usda(usd.to_text(toy_splats.scene(degree), time_s, sky=True).decode())
+    assert stage["metadata"]["upAxis"] == '"Z"' and stage["metadata"]["metersPerUnit"] == "1"
+    assert stage["metadata"]["defaultPrim"] == '"World"' and stage["World"]["type"] == "Xform"
+    nodes = [prim for prim in stage["World"].values() if isinstance(prim, dict) and "splats" in prim]
+    assert len(nodes) == (3 if time_s is None else 1)
+    for node in nodes:
+        assert node["splats"]["type"] == "ParticleField3DGaussianSplat"
+        assert usd_problems(node["splats"]) == []
+
+
+@pytest.mark.parametrize("time_s", [-0.5, -0.1, 0.25, 0.4, 0.9, 1.0])
+def test_usd_moves_and_bends_as_the_scene_does(time_s: float) -> None:
+    scene = toy_splats.scene()
+    stage, shown, code = slow.parse_usda(usd.to_text(scene).decode()), [], time_s * 1000
+    for node in (prim for prim in stage["World"].values() if isinstance(prim, dict) and "splats" in prim):
+        places = node["splats"]["positions"]
+        if isinstance(places, dict):
+            places = at_time(list(places), np.array(list(places.values())), code)
+        translation, turn = np.zeros(3), np.array([1.0, 0, 0, 0])
+        if "xformOp:translate" in node:
+            keys = list(node["xformOp:translate"])
+            assert node["xformOpOrder"] == ["xformOp:translate", "xformOp:orient"]
+            translation = at_time(keys, np.array(list(node["xformOp:translate"].values())), code)
+            turn = at_time(keys, np.array(list(node["xformOp:orient"].values())), code, True)
+            held = [word for key, word in node["visibility"].items() if key <= code + 1e-6]
+            if (held or list(node["visibility"].values()))[-1 if held else 0] == "invisible":
+                continue
+        shown.append(posed(slow.read_usd_splats(node["splats"], places), translation, turn))
+    assert np.abs(ordered(np.concatenate(shown)) - moment(scene, time_s)).max() < 1e-4
+
+
+def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None:
+    scene = toy_splats.scene()
+    archive = zipfile.ZipFile(io.BytesIO(usd.to_package(scene)))
+    assert archive.namelist() == ["scene.usda", "sky.png"] and all(
+        i.compress_type == zipfile.ZIP_STORED for i in archive.infolist()
+    )
+    dome = slow.parse_usda(archive.read("scene.usda").decode())["World"]["Sky"]
+    picture = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))
+    turn = geometry.matrix_from_quaternion(dome["xformOp:orient"])
+    assert scene.sky is not None
+    rows, columns = scene.sky.shape[:2]
+    for row in range(rows):
+        for column in range(columns):  # OpenEXR: longitude from pi to -pi, 0 along z, pi/2 along x
+            latitude, longitude = np.pi / 2 - (row + 0.5) / rows * np.pi, np.pi - (column + 0.5) / columns * 2 * np.pi
+            d = np.array([np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)])
+            x, y, z = turn @ d
+            ours = (
+                int((np.arctan2(y, x) / (2 * np.pi) + 0.5) * columns) % columns,
+                int((0.5 - np.arcsin(z) / np.pi) * rows),
+            )
+            assert (picture[row, column] == scene.sky[ours[1], ours[0]]).all()
+
+
+def test_cameras_of_a_stage_see_what_ours_see(tmp_path: Path) -> None:
+    scene = ToyStreet(times=[0.0, 0.1]).write(tmp_path / "scene", width=24, height=12)
+    camera = replace(scene.cameras["front"], cx=10.0, cy=7.5)
+    frames = tuple(replace(f, view=replace(f.view, camera=camera)) for f in scene.frames)
+    log = replace(scene, cameras={"front": camera}, frames=frames)
+    prim = slow.parse_usda(usd.to_text(toy_splats.scene(), log=log).decode())["World"]["camera_front"]
+    assert list(prim["xformOp:translate"]) == [0, 100]
+    for frame in log.frames:
+        code = round(frame.view.time_s * 1000)
+        turn = geometry.matrix_from_quaternion(prim["xformOp:orient"][code])
+        pose = geometry.from_rotation_translation(turn, prim["xformOp:translate"][code])
+        point = (frame.view.world_from_cam @ [0.7, -0.4, 6.0, 1.0])[:3]
+        x, y, z = geometry.transform_points(geometry.invert(pose), point[None])[0]
+        wide, high = prim["horizontalAperture"], prim["verticalAperture"]
+        across = (x / -z * prim["focalLength"] - prim["horizontalApertureOffset"]) / wide + 0.5
+        upwards = (y / -z * prim["focalLength"] - prim["verticalApertureOffset"]) / high + 0.5
+        assert np.allclose(
+            [across * 24, (1 - upwards) * 12], geometry.project(frame.view, point[None])[0][0], atol=1e-4
+        )
+
+
+def test_names_and_texts_cannot_break_out_of_a_stage() -> None:
+    scene = toy_splats.scene()
+    evil = replace(scene.nodes[1], name='x"\n}\ndef "y', label='a\\"b')
+    stage = slow.parse_usda(
+        usd.to_text(replace(scene, nodes=(scene.nodes[0], evil), facts={"method": '"\n)'})).decode()
+    )
+    assert list(stage["World"]) == ["type", "background", "x____def__y"]
+    assert stage["World"]["x____def__y"]["mudg:label"] == 'a\\"b'
+
+
+def test_empty_nodes_do_no_harm() -> None:
+    scene = toy_splats.scene()
+    nothing = SplatCloud(
+        *(getattr(scene.nodes[0].cloud, name)[:0] for name in ("means", "quats", "log_scales", "logits", "sh"))
+    )
+    bare = replace(scene, nodes=(replace(scene.nodes[0], cloud=nothing), *scene.nodes[1:]))
+    assert gltf_problems(gltf.to_bytes(bare)) == []
+    assert slow.parse_usda(usd.to_text(bare).decode())["World"]["background"]["splats"]["positions"] == []

@@ -1,0 +1,167 @@
+"""Compare files of `mudg export` with the programs of others, those that are installed.
+
+    python tools/check_exports.py RUN --out FOLDER [--node-modules FOLDER]
+
+RUN: a fit, or the folder of a finished `mudg run`. FOLDER gets the files. Programs, each checked only where it is found:
+
+    npm install @playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10    reads and writes SPZ, SOG, ...; rules of glTF
+    pip install usd-core mcap                                                       rules of USD; messages
+
+Prints one line per file and program; the exit code is the number of failures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mudg.base.geometry import matrix_from_quaternion
+from mudg.data.splats.cloud import SplatCloud
+from mudg.data.splats.formats import FORMATS, read_cloud
+from mudg.stages.config import ExportConfig
+from mudg.stages.exporting import export
+
+SINGLE = ("ply", "spz", "compressed-ply", "sog", "splat")
+STEP_M = {"spz": 0.001, "ply": 1e-4, "compressed-ply": 0.02, "sog": 0.02, "splat": 1e-4}
+VALIDATE = """
+const v = require(process.argv[1]); const fs = require('fs');
+v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])), {maxIssues: 0}).then(r => console.log(JSON.stringify(r.issues.messages)));
+"""
+
+
+def main() -> int:
+    """Write and check; returns the number of failures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--node-modules", type=Path, default=Path("node_modules"))
+    given = parser.parse_args()
+    failures = 0
+    files = written(given.run, given.out)
+    tool = given.node_modules / ".bin" / "splat-transform"
+    for name in SINGLE:
+        failures += report(
+            f"{name} read by splat-transform",
+            against_splat_transform(tool, name, files[name]) if tool.exists() else None,
+        )
+    validator = given.node_modules / "gltf-validator"
+    failures += report("glb by glTF-Validator", of_gltf(validator, files["glb"]) if validator.exists() else None)
+    for name in ("usda", "usdz"):
+        failures += report(f"{name} by usd-core", of_usd(files[name]) if importlib.util.find_spec("pxr") else None)
+    has_mcap = importlib.util.find_spec("mcap") is not None and "mcap" in files
+    failures += report("mcap by mcap", of_mcap(files["mcap"]) if has_mcap else None)
+    return failures
+
+
+def report(title: str, problem: str | None) -> int:
+    """Print one line; 1 for a failure. ``None``: not checked; empty: fine."""
+    print(f"{title}: {'not installed' if problem is None else problem or 'ok'}", flush=True)
+    return int(bool(problem))
+
+
+def written(run: Path, out: Path) -> dict[str, Path]:
+    """All files of a run, one moment for formats without motion."""
+    found = {}
+    for name in (*SINGLE, "glb", "usda", "usdz", "mcap"):
+        suffix = ".mcap" if name == "mcap" else FORMATS[name].suffixes[0]
+        found[name] = out / f"scene{suffix}"
+        if name == "mcap" and not (run / "scene").is_dir():
+            del found[name]
+            continue
+        export.run(ExportConfig(), name, run, found[name], overwrite=True)
+    return found
+
+
+def against_splat_transform(tool: Path, name: str, file: Path) -> str:
+    """Our reading of a file against our reading of the PLY that their program makes of it; and that it reads back what we wrote."""
+    made = file.with_name(f"theirs_{name}.ply")
+    done = subprocess.run(
+        [str(tool), "-w", "-g", "cpu", str(file), str(made)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        return f"failed: {(done.stderr or done.stdout).strip()[-200:]}"
+    ours, theirs = (read_cloud(path.read_bytes(), path.name)[0] for path in (file, made))
+    return difference(ours, theirs, STEP_M[name])
+
+
+def difference(ours: SplatCloud, theirs: SplatCloud, step_m: float) -> str:
+    """Where two clouds differ, or nothing."""
+    if len(ours) != len(theirs):
+        return f"{len(theirs)} Gaussians instead of {len(ours)}"
+    apart, rows = cKDTree(theirs.means).query(ours.means, workers=1)
+    matched = theirs.take(np.asarray(rows))
+    found = {
+        "m": float(apart.max()), "log size": float(np.median(np.abs(ours.log_scales - matched.log_scales))),
+        "opacity": float(np.median(np.abs(ours.opacity - matched.opacity))),
+        "color": float(np.median(np.abs(ours.sh[:, 0] - matched.sh[:, 0]))),
+        "covariance": float(np.median(np.linalg.norm(covariances(ours) - covariances(matched), axis=(1, 2))
+                                      / np.linalg.norm(covariances(ours), axis=(1, 2)))),
+    }  # fmt: skip
+    if ours.degree:
+        found["harmonics"] = float(np.median(np.abs(ours.sh[:, 1:] - matched.sh[:, 1:])))
+    limits = {"harmonics": 0.05, "m": step_m, "log size": 0.01, "opacity": 0.01, "color": 0.02, "covariance": 0.05}
+    return ", ".join(
+        f"{key} {value:.3g} (limit {limits[key]:g})" for key, value in found.items() if value > limits[key]
+    )
+
+
+def covariances(cloud: SplatCloud) -> np.ndarray:
+    """Of every Gaussian, f64[n, 3, 3]: equal where rotations differ by half a turn about an axis of the ellipsoid."""
+    rotations = np.stack([matrix_from_quaternion(quat) for quat in cloud.quats])
+    return np.einsum("nij,nj,nkj->nik", rotations, np.exp(2 * cloud.log_scales.astype(np.float64)), rotations)
+
+
+def of_gltf(validator: Path, file: Path) -> str:
+    """Issues but those of the extension, which the validator does not know."""
+    done = subprocess.run(
+        ["node", "-e", VALIDATE, str(validator.resolve()), str(file)], capture_output=True, text=True, check=True
+    )
+    issues = [
+        issue for issue in json.loads(done.stdout)
+        if not (issue["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and "KHR_gaussian_splatting:" in issue["pointer"])
+        and issue["code"] != "UNSUPPORTED_EXTENSION"
+    ]  # fmt: skip
+    return "; ".join(f"{issue['code']} {issue['pointer']}" for issue in issues[:5])
+
+
+def of_usd(file: Path) -> str:
+    """Errors of all validators, and whether the fields of particles are what we say."""
+    from pxr import Usd, UsdValidation  # type: ignore[import-not-found]
+
+    stage = Usd.Stage.Open(str(file))
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    errors = [error for error in context.Validate(stage) if not error.HasNoError()]
+    fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    if not fields or errors:
+        return "; ".join(error.GetMessage() for error in errors[:5]) or "no particle fields"
+    for prim in fields:
+        count = len(prim.GetAttribute("orientations").Get())
+        places = prim.GetAttribute("positions")
+        samples = places.GetTimeSamples()
+        if len(places.Get(samples[0]) if samples else places.Get()) != count:
+            return f"{prim.GetPath()}: lengths differ"
+    return ""
+
+
+def of_mcap(file: Path) -> str:
+    """Whether every message is read, in order."""
+    from mcap.reader import make_reader  # type: ignore[import-not-found]
+
+    with file.open("rb") as handle:
+        reader = make_reader(handle, validate_crcs=True)
+        summary = reader.get_summary()
+        times = [message.log_time for _, _, message in reader.iter_messages()]
+    if summary is None or summary.statistics.message_count != len(times) or times != sorted(times):
+        return "the messages are not those of the summary"
+    return ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())
