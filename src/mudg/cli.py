@@ -134,6 +134,18 @@ def _asset(args: f.AssetFlags) -> dict[str, Any]:
     return {"asset": assets.run_export(args.run, args.id, args.out, args.scene, args.overwrite)}
 
 
+def _page(args: f.PageFlags) -> dict[str, Any]:
+    from mudg.stages import view
+
+    return view.run_page(args.settings, args.run, args.out, scene=args.scene, compare=args.compare, overwrite=args.overwrite)
+
+
+def _view(args: f.ViewFlags) -> dict[str, Any]:
+    from mudg.stages import view
+
+    return view.run_view(args.settings, args.run, args.compare, scene=args.scene)
+
+
 def _score(args: f.Score) -> dict[str, Any]:
     from mudg.stages import score
 
@@ -265,6 +277,17 @@ VERBS: dict[str, Verb] = {
         ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",),
         _asset,
     ),
+    "page": Verb(
+        "Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network.",
+        ("mudg page runs/kitti --out kitti.html", "mudg page runs/kitti --compare runs/kitti --out both.html",
+         "mudg page runs/mudg_s --scene scenes/city --out city.html"),
+        _page,
+    ),
+    "view": Verb(
+        "Show a fitted scene in a browser, with exact frames from the rasterizer.",
+        ("mudg view runs/kitti", "mudg view runs/a runs/b", "mudg view runs/mudg_s --scene scenes/city --port 8080"),
+        _view,
+    ),
     "score": Verb(
         "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
@@ -283,6 +306,7 @@ VERBS: dict[str, Verb] = {
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
+    ("look at a drive", ("view", "page")),
     ("change a drive", ("edit", "asset")),
     ("benchmarks", ("bench",)),
     ("published models", ("convert",)),
