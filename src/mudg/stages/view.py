@@ -134,8 +134,8 @@ def about_text(scene: Scene, packed: Packed) -> str:
     left = packed.given - packed.kept
     return (
         f"{packed.kept:,} Gaussians{f' of {packed.given:,}' if left else ''}, {len(scene.frames)} recorded frames of "
-        f"{len(scene.cameras)} cameras, {len(scene.tracks)} tracked objects. Places, sizes and colours are rounded for the page. Data: {scene.source.dataset}, "
-        f"licence {scene.source.licence}. This page loads nothing and sends nothing."
+        f"{len(scene.cameras)} cameras, {len(scene.tracks)} tracked objects. Places, sizes and colours are rounded "
+        f"for the page. Data: {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing and sends nothing."
     )
 
 
