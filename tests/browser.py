@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+)
 NO_BROWSER = "no Chromium is installed"
 FLAGS = (
     "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
@@ -31,7 +33,9 @@ class BrowserError(Exception):
 class Browser:
     """One page of one browser. ``errors`` collects what it writes to its console as errors, and what it throws."""
 
-    def __init__(self, profile: Path, size: tuple[int, int] = (960, 640), scale: float = 1.0, dark: bool = False) -> None:
+    def __init__(
+        self, profile: Path, size: tuple[int, int] = (960, 640), scale: float = 1.0, dark: bool = False
+    ) -> None:
         ours, theirs = os.pipe(), os.pipe()  # what it reads, what it writes
         address = [f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "about:blank"]
         plumbing = f'exec "$@" 3<&{ours[0]} 4>&{theirs[1]}'  # the protocol's pipes have fixed numbers
@@ -50,7 +54,13 @@ class Browser:
         self.session = self.call("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
-        self.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=scale, mobile=size[0] < 600)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=size[0],
+            height=size[1],
+            deviceScaleFactor=scale,
+            mobile=size[0] < 600,
+        )
         if dark:
             self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
 
@@ -98,7 +108,9 @@ class Browser:
         elif what == "Network.requestWillBeSent" and not given["request"]["url"].startswith("data:"):
             self.requests.append(given["request"]["url"])
 
-    def open(self, address: str, ready: str = "document.documentElement.dataset.ready === 'yes'", timeout_s: float = 60) -> None:
+    def open(
+        self, address: str, ready: str = "document.documentElement?.dataset.ready === 'yes'", timeout_s: float = 60
+    ) -> None:
         """Go to an address and wait until an expression is true there."""
         self.call("Page.navigate", url=address)
         self.wait(ready, timeout_s)
@@ -109,7 +121,7 @@ class Browser:
         while time.monotonic() < end:
             if self.run(expression):
                 return
-            problem = self.run("document.documentElement?.dataset.problem ?? ''")
+            problem = self.run("document.documentElement?.dataset?.problem ?? ''")
             if problem:
                 raise BrowserError(problem)
             time.sleep(0.05)
@@ -133,7 +145,9 @@ class Browser:
         size = found["height"], found["width"], 4
         made = {}
         for name, text in found["values"].items():
-            values = np.frombuffer(base64.b64decode(text), np.uint8 if name in ("color", "class") else np.float32).reshape(size)
+            values = np.frombuffer(
+                base64.b64decode(text), np.uint8 if name in ("color", "class") else np.float32
+            ).reshape(size)
             made[name] = values[..., 0] if name == "class" else values
         return made
 

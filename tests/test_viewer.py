@@ -21,9 +21,9 @@ from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
 from mudg.report.viewer.packed import BLOCK, blob_of, morton_codes, pack_scene, smallest_three
-from mudg.stages import view
 from mudg.stages.config.view import PageConfig, ViewConfig
 from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.viewing import view
 from mudg.stages.viewing.server import token_for
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
@@ -124,7 +124,9 @@ def test_a_page_is_not_replaced_without_being_asked(toy: tuple[Path, Path, Scene
         view.run_page(PageConfig(), toy[1], toy[0] / "other.html")
 
 
-def test_a_large_page_becomes_a_folder(toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_page_becomes_a_folder(
+    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
     made = view.run_page(PageConfig(images=0), toy[1], tmp_path / "page.html", scene=toy[0] / "scene")
     assert made["page"] == tmp_path / "page" / "index.html"
@@ -158,7 +160,9 @@ def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[P
         true = render_view(model, wanted, RasterConfig(near_m=NEAR_M))
         seen = opened.measure(["color", "depth", "class", "confidence"], camera="front", t=time_s, shift=shift_m)
         assert psnr(seen["color"][..., :3] / 255.0, true.rgb.permute(1, 2, 0).numpy()) >= 38
-        depth = np.where(seen["depth"][..., 3] >= 0.5, seen["depth"][..., 0] / np.maximum(seen["depth"][..., 3], 1e-6), np.nan)
+        depth = np.where(
+            seen["depth"][..., 3] >= 0.5, seen["depth"][..., 0] / np.maximum(seen["depth"][..., 3], 1e-6), np.nan
+        )
         both = np.isfinite(depth) & np.isfinite(true.depth[0].numpy())
         assert np.median(np.abs(depth[both] / true.depth[0].numpy()[both] - 1)) <= 0.01
         assert (seen["class"] == true.semantics.numpy()).mean() >= 0.97
@@ -170,7 +174,12 @@ def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[P
 @needs_browser
 def test_the_page_loads_nothing_and_says_no_foreign_script(opened: Browser) -> None:
     assert all(address.startswith(("file://", "blob:", "data:")) for address in opened.requests)
-    assert opened.run("[...document.querySelectorAll('#objects .name')].map((e) => e.textContent).join()").count("<script>") == 1
+    assert (
+        opened.run("[...document.querySelectorAll('#objects .name')].map((e) => e.textContent).join()").count(
+            "<script>"
+        )
+        == 1
+    )
     assert opened.run("document.querySelectorAll('#objects script').length") == 0
 
 
@@ -183,8 +192,10 @@ def test_a_link_shows_the_same(opened: Browser) -> None:
     assert {"t": 0.6, "shift": 1.5, "compare": "difference-scene", "boxes": True}.items() <= json.loads(state).items()
     assert opened.run("location.hash").count("l=depth") == 1
     # the same fit twice differs nowhere
-    middle = "const c = document.createElement('canvas'); c.width = c.height = 64; const x = c.getContext('2d');" \
+    middle = (
+        "const c = document.createElement('canvas'); c.width = c.height = 64; const x = c.getContext('2d');"
         "x.drawImage(document.getElementById('canvas'), 0, 0, 64, 64); const p = x.getImageData(24, 24, 16, 16).data;"
+    )
     shown = opened.run(f"(() => {{ {middle} return Math.max(...p.filter((_, i) => i % 4 < 3)); }})()")
     assert shown == 0
 
@@ -217,7 +228,9 @@ def served(toy: tuple[Path, Path, SceneModel]) -> Iterator[tuple[int, str]]:
 def ask(port: int, method: str, path: str, body: object = None, **headers: str) -> tuple[int, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     named = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named})
+    connection.request(
+        method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named}
+    )
     answer = connection.getresponse()
     return answer.status, answer.read()
 
@@ -274,5 +287,3 @@ def test_fits_of_different_logs_are_not_compared(toy: tuple[Path, Path, SceneMod
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
     with pytest.raises(InputError, match="another"):
         view.find_shown(PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")
-
-

@@ -65,11 +65,15 @@ def _person(rng: np.random.Generator) -> DeformableNode:
         pose[:3, 3] = (7.0, -2.0 + 2 * t, 0.9)
     node = DeformableNode("<script>alert(1)</script>", "pedestrian", PERSON_M, times, poses)
     along, across, up = (cells + 1 for cells in DEFORM_CELLS)
-    node.offsets.columns["deform"] = torch.from_numpy(rng.uniform(-0.2, 0.2, (len(times), 3, up, across, along)).astype(np.float32))
+    node.offsets.columns["deform"] = torch.from_numpy(
+        rng.uniform(-0.2, 0.2, (len(times), 3, up, across, along)).astype(np.float32)
+    )
     return node
 
 
-def write_toy_run(root: Path, degree: int = 3, width: int = 160, height: int = 96) -> tuple[Path, Path, Scene, SceneModel]:
+def write_toy_run(
+    root: Path, degree: int = 3, width: int = 160, height: int = 96
+) -> tuple[Path, Path, Scene, SceneModel]:
     """The scene folder and the fit folder of the toy, with what is in them."""
     scene = STREET.write(root / "scene", width=width, height=height)
     model = toy_fitted(degree)

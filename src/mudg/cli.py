@@ -135,13 +135,13 @@ def _asset(args: f.AssetFlags) -> dict[str, Any]:
 
 
 def _page(args: f.PageFlags) -> dict[str, Any]:
-    from mudg.stages import view
+    from mudg.stages.viewing import view
 
     return view.run_page(args.settings, args.run, args.out, scene=args.scene, compare=args.compare, overwrite=args.overwrite)
 
 
 def _view(args: f.ViewFlags) -> dict[str, Any]:
-    from mudg.stages import view
+    from mudg.stages.viewing import view
 
     return view.run_view(args.settings, args.run, args.compare, scene=args.scene)
 

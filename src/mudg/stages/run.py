@@ -106,8 +106,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 def _write_viewer(out: Path) -> Path:
     """Write the page that shows the fitted scene in a browser."""
     from mudg.report.run_report import VIEWER
-    from mudg.stages import view
     from mudg.stages.config import PageConfig
+    from mudg.stages.viewing import view
 
     return view.run_page(PageConfig(), out, out / VIEWER, report="report.html", overwrite=True)["page"]
 

@@ -75,6 +75,12 @@ export class App {
     for (const listener of this.listeners) listener(this.state);
   }
 
+  /** Draws the same once more, because something that was missing is there. */
+  again() {
+    this.dirty = true;
+    this.sharp = false;
+  }
+
   /** The scenes in use: the one that is shown, and the one it is compared with. */
   used() {
     const { scene, compare } = this.state, mode = compare.split("-")[0], other = compare.split("-")[1];
@@ -93,7 +99,7 @@ export class App {
     this.before = now;
     const resting = now - this.changed > REST_MS && !s.playing;
     if (!this.dirty && (this.sharp || !resting)) return;
-    this.draw(resting && !this.dirty ? 1 : this.quality, resting);
+    this.draw(resting ? 1 : this.quality, resting);
   }
 
   /** Sizes of canvas and picture in pixels: [canvas width, height, ratio]. */
@@ -131,7 +137,7 @@ export class App {
     const key = [this.state.t, ...view.eye, ...view.axes[2], [...this.state.hidden].join()].join();
     if (loaded.key === key) return;
     loaded.key = key;
-    this.renderer.sort(loaded, view, this.state.t, this.state.hidden, (there) => { if (there) this.dirty = true; });
+    this.renderer.sort(loaded, view, this.state.t, this.state.hidden, (there) => { if (there) this.again(); });
   }
 
   pictureOf(name, loaded, view, layer = this.state.layer) {
@@ -177,7 +183,7 @@ export class App {
       const bytes = this.photographs.subarray(frame.image[0], frame.image[0] + frame.image[1]);
       this.images.set(frame.id, null);
       createImageBitmap(new Blob([bytes], { type: "image/webp" }), { colorSpaceConversion: "none" })
-        .then((bitmap) => { this.images.set(frame.id, bitmap); this.dirty = true; });
+        .then((bitmap) => { this.images.set(frame.id, bitmap); this.again(); });
     }
     return this.images.get(frame.id);
   }

@@ -28,7 +28,7 @@ REACH_M: Final = 80.0
 
 
 @dataclass(frozen=True, slots=True)
-class LogFacts:
+class PageFacts:
     """The log for the page.
 
     Args:
@@ -45,7 +45,7 @@ def begin_of(scene: Scene) -> float:
     return min(frame.view.time_s for frame in scene.frames)
 
 
-def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images: int, most_points: int) -> LogFacts:
+def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images: int, most_points: int) -> PageFacts:
     """Everything but the Gaussians.
 
     Args:
@@ -57,7 +57,9 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
     keys, tracks = [key_rows(scene.ego.times_s - begin, scene.ego.world_from_ego)], []
     for track in scene.tracks:
         first = sum(map(len, keys))
-        tracks.append({"id": track.id, "label": track.label, "size_m": track.size_m.tolist(), "keys": [first, len(track.times_s)]})
+        tracks.append(
+            {"id": track.id, "label": track.label, "size_m": track.size_m.tolist(), "keys": [first, len(track.times_s)]}
+        )
         keys.append(key_rows(track.times_s - begin, track.world_from_object))
     places, images = _images(scene, frames, image_width, most_images)
     sweeps, points = _lidar(scene, begin, most_points)
@@ -73,7 +75,7 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
         "class_names": list(palette.CLASSES), "class_colors": palette.DISPLAY_COLORS.tolist(), "depth_range_m": [NEAR_M, FAR_M],
         "depth_colors": depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist(),
     }  # fmt: skip
-    return LogFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
+    return PageFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
 
 
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:

@@ -80,7 +80,12 @@ def pack_scene(model: SceneModel, begin_s: float, path: NDArray[np.floating] | N
         rows = np.sort(rows[np.argsort(-worth, kind="stable")[:most]])
     rows = rows[np.lexsort((morton_codes(columns["means"][rows], node[rows]), node[rows]))]
     blocks = list(_blocks(node[rows]))
-    facts: dict[str, Any] = {"rows": len(rows), "degree": model.sh_degree, "classes": list(model.classes), "lead_step": LEAD_STEP}
+    facts: dict[str, Any] = {
+        "rows": len(rows),
+        "degree": model.sh_degree,
+        "classes": list(model.classes),
+        "lead_step": LEAD_STEP,
+    }
     sections = _geometry(columns, rows, blocks) | {"block_of": np.array([(n, len(b)) for n, b in blocks], np.uint32)}
     low, high, sections["color"] = _colors(columns["sh_dc"][rows, 0], opacity[rows], model.sh_degree)
     facts |= {"color_low": low, "color_high": high}
@@ -100,7 +105,9 @@ def pack_scene(model: SceneModel, begin_s: float, path: NDArray[np.floating] | N
 def _notes(model: SceneModel) -> tuple[str, ...]:
     inexact = (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)
     if any(isinstance(node, inexact) for node in model.nodes):
-        return ("Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them.",)
+        return (
+            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them.",
+        )
     return ()
 
 
@@ -148,7 +155,12 @@ def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any
         bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255)
     bytes_of = np.concatenate([(places & 255).T, (places >> 8).T]).astype(np.uint8)
     turns = smallest_three(columns["quats"][rows].astype(np.float64))
-    return {"block": bounds, "position": bytes_of, "scale": sizes.T.copy(), "rotation": turns.view(np.uint8).reshape(-1, 4).T.copy()}
+    return {
+        "block": bounds,
+        "position": bytes_of,
+        "scale": sizes.T.copy(),
+        "rotation": turns.view(np.uint8).reshape(-1, 4).T.copy(),
+    }
 
 
 def _quantised(values: NDArray[np.float64], levels: int) -> tuple[Any, Any, Any]:
@@ -171,7 +183,9 @@ def smallest_three(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
 
 def _colors(bands: Any, opacity: Any, degree: int) -> tuple[float, float, NDArray[np.uint8]]:
     rgb = bands * SH_BAND_0 + 0.5
-    low = max(float(rgb.min(initial=0)), COLOR_LIMITS[0]) if degree else 0.0  # without further bands what is below 0 is drawn as 0
+    low = (
+        max(float(rgb.min(initial=0)), COLOR_LIMITS[0]) if degree else 0.0
+    )  # without further bands what is below 0 is drawn as 0
     high = min(max(float(rgb.max(initial=1)), 1.0), COLOR_LIMITS[1])
     level = to_u8((rgb - low) / (high - low))
     return low, high, np.concatenate([level.T, to_u8(opacity)[None]])

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from mudg.base import store
 from mudg.report import html
-from mudg.report.viewer.facts import LogFacts
+from mudg.report.viewer.facts import PageFacts
 from mudg.report.viewer.packed import Packed, blob_of
 
 ONE_FILE_BYTES: Final = 32 * 2**20
@@ -39,7 +39,7 @@ class ViewerPage:
     about: str
     report: str
     scenes: Sequence[tuple[str, Packed]]
-    log: LogFacts
+    log: PageFacts
     live: Mapping[str, Any] | None = None
 
     def build(self) -> tuple[dict[str, bytes], dict[str, Any]]:
@@ -47,7 +47,11 @@ class ViewerPage:
         data, facts = {}, dict(self.log.facts)
         blob, directory = blob_of(self.log.sections)
         data["log"] = _gzipped(blob)
-        facts |= {"log": {"directory": directory, "url": "log.bin"}, "images": facts["images"] | {"url": "images.bin"}, "scenes": []}
+        facts |= {
+            "log": {"directory": directory, "url": "log.bin"},
+            "images": facts["images"] | {"url": "images.bin"},
+            "scenes": [],
+        }
         facts["live"] = None if self.live is None else dict(self.live)
         for index, (name, packed) in enumerate(self.scenes):
             blob, directory = blob_of(packed.sections)
@@ -91,13 +95,18 @@ def asset(name: str) -> str:
 def import_map() -> str:
     """The viewer's modules as an import map of data addresses: a page opened by double click may not load files beside it."""
     sources = {f"mudg/{name}": asset(f"{name}.js") for name in MODULES}
-    coded = {name: "data:text/javascript;base64," + base64.b64encode(text.encode()).decode() for name, text in sources.items()}
+    coded = {
+        name: "data:text/javascript;base64," + base64.b64encode(text.encode()).decode()
+        for name, text in sources.items()
+    }
     return script_json({"imports": coded})
 
 
 def policy(*scripts: str) -> str:
     """A content security policy under which only these inline scripts run, and nothing is loaded from elsewhere."""
-    hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts)
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts
+    )
     return (
         f"default-src 'none'; script-src {hashes} data: blob:; worker-src blob:; style-src 'unsafe-inline'; "
         "img-src 'self' data: blob:; media-src blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"

@@ -66,9 +66,11 @@ def open_server(site: Site, host: str, port: int) -> ThreadingHTTPServer:
         ResourceError: the port is taken, or the address is none of this machine.
     """
     try:
-        server = ThreadingHTTPServer((host, port), type("SiteHandler", (Handler,), {"site": site}))
+        server = ThreadingHTTPServer((host, port), type("OwnSiteRequest", (SiteRequest,), {"site": site}))
     except OSError as error:
-        raise ResourceError("cannot listen", where=f"{host}:{port}", got=str(error), remedy="choose another --port") from error
+        raise ResourceError(
+            "cannot listen", where=f"{host}:{port}", got=str(error), remedy="choose another --port"
+        ) from error
     server.daemon_threads = True
     return server
 
@@ -81,14 +83,19 @@ def address_of(server: ThreadingHTTPServer, site: Site) -> str:
 
 def show(address: str, port: int, wanted: bool) -> bool:
     """Open a browser, or say how to reach the page from another machine; whether one was opened."""
-    graphical = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or os.name == "nt" or os.uname().sysname == "Darwin"
+    graphical = (
+        os.environ.get("DISPLAY")
+        or os.environ.get("WAYLAND_DISPLAY")
+        or os.name == "nt"
+        or os.uname().sysname == "Darwin"
+    )
     if wanted and graphical and webbrowser.open(address):
         return True
     log.info(f"no browser here. From your own machine: ssh -N -L {port}:127.0.0.1:{port} {os.uname().nodename}")
     return False
 
 
-class Handler(BaseHTTPRequestHandler):
+class SiteRequest(BaseHTTPRequestHandler):
     """Answers one request. ``site`` is set by ``open_server``."""
 
     site: Site
@@ -146,13 +153,19 @@ class Handler(BaseHTTPRequestHandler):
         if given not in names and (is_loopback(str(host)) or str(host) not in ("0.0.0.0", "::")):  # noqa: S104
             self._answer(HTTPStatus.FORBIDDEN, b"this server has another name")
             return True
-        brought = [*query.get("token", []), self.headers.get("X-Mudg-Token", ""), *_cookies(self.headers.get("Cookie", ""))]
+        brought = [
+            *query.get("token", []),
+            self.headers.get("X-Mudg-Token", ""),
+            *_cookies(self.headers.get("Cookie", "")),
+        ]
         if not any(hmac.compare_digest(one.encode(), self.site.token.encode()) for one in brought):
             self._answer(HTTPStatus.FORBIDDEN, b"open the address that mudg view printed: it carries a token")
             return True
         return False
 
-    def _answer(self, status: HTTPStatus, content: bytes, kind: str = "text/plain; charset=utf-8", cookie: bool = False) -> None:
+    def _answer(
+        self, status: HTTPStatus, content: bytes, kind: str = "text/plain; charset=utf-8", cookie: bool = False
+    ) -> None:
         self.send_response(status)
         for name, value in {
             "Content-Type": kind, "Content-Length": str(len(content)), "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
@@ -174,4 +187,3 @@ class Handler(BaseHTTPRequestHandler):
 def _cookies(text: str) -> list[str]:
     pairs = (part.strip().partition("=") for part in text.split(";"))
     return [value for name, _, value in pairs if name == COOKIE]
-

@@ -73,7 +73,12 @@ def run_page(
     if whole:
         content = page.one_file(data, facts)
         store.atomic_write(out, content)
-        return {"page": out, "bytes": len(content), "gaussians": kept, "text": f"page: {out.resolve()} ({len(content) / 1e6:.1f} MB)"}
+        return {
+            "page": out,
+            "bytes": len(content),
+            "gaussians": kept,
+            "text": f"page: {out.resolve()} ({len(content) / 1e6:.1f} MB)",
+        }
     files = page.folder(data, facts)
     for name, content in files.items():
         store.atomic_write(folder / name, content)
@@ -96,12 +101,20 @@ def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path 
     parts = find_run(run)
     place = scene or parts.scene
     if place is None:
-        raise UsageError("a fit alone does not know its log", where=str(run), remedy="add --scene FOLDER, or give the folder of a run")
+        raise UsageError(
+            "a fit alone does not know its log",
+            where=str(run),
+            remedy="add --scene FOLDER, or give the folder of a run",
+        )
     loaded = read_scene(place)
     fits = [_fit_of(parts, config.method, loaded)]
     if compare is not None:
         others = find_run(compare)
-        same = config.method if Path(compare).resolve() != Path(run).resolve() else next((n for n in others.fits if n != fits[0][0]), "")
+        same = (
+            config.method
+            if Path(compare).resolve() != Path(run).resolve()
+            else next((n for n in others.fits if n != fits[0][0]), "")
+        )
         fits.append(_fit_of(others, same, loaded))
     return Shown(loaded, tuple(fits))
 
@@ -112,7 +125,12 @@ def _fit_of(parts: RunParts, method: str, scene: Scene) -> tuple[str, SceneModel
     folder = parts.fits[method] if method in parts.fits else parts.model
     model = model_of_scene(folder, scene) if not parts.whole else load_model(folder)
     if model.facts.get("scene", scene.id) != scene.id:
-        raise InputError("fits of different logs cannot be compared", where=str(folder), expected=scene.id, got=str(model.facts["scene"]))
+        raise InputError(
+            "fits of different logs cannot be compared",
+            where=str(folder),
+            expected=scene.id,
+            got=str(model.facts["scene"]),
+        )
     return str(model.facts.get("method", "fit")), model
 
 
@@ -141,12 +159,16 @@ def about_text(scene: Scene, packed: Packed) -> str:
 
 def budget_text(page: ViewerPage, data: dict[str, bytes], out: Path) -> str:
     """What the page will take, before it is written."""
-    parts = [f"{name.replace('scene-', 'scene ')} {len(content) / 1e6:.2f} MB" for name, content in data.items() if content]
+    parts = [
+        f"{name.replace('scene-', 'scene ')} {len(content) / 1e6:.2f} MB" for name, content in data.items() if content
+    ]
     counts = [f"{packed.kept:,} of {packed.given:,} Gaussians" for _, packed in page.scenes]
     return f"page {out}: {'; '.join(counts)}; {', '.join(parts)}"
 
 
-def run_view(config: ViewConfig, run: Path, compare: Path | None = None, *, scene: Path | None = None) -> dict[str, Any]:
+def run_view(
+    config: ViewConfig, run: Path, compare: Path | None = None, *, scene: Path | None = None
+) -> dict[str, Any]:
     """Serve the page of a run until it is interrupted.
 
     Raises:
@@ -165,7 +187,9 @@ def run_view(config: ViewConfig, run: Path, compare: Path | None = None, *, scen
     return {"address": address}
 
 
-def server_of(config: ViewConfig, run: Path, compare: Path | None, scene: Path | None) -> tuple[ThreadingHTTPServer, Site]:
+def server_of(
+    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None
+) -> tuple[ThreadingHTTPServer, Site]:
     """The server of a run's page, listening, and what it serves."""
     token = token_for(config.host, config.token)
     shown = find_shown(config, run, scene, compare)
