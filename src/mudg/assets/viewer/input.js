@@ -15,7 +15,6 @@ export function listen(app, controls) {
 function pointers(app) {
   const { stage } = app, fingers = new Map();
   let spread = 0, moved = 0;
-  const scale = () => app.last.ratio ?? 1;
   stage.addEventListener("pointerdown", (event) => {
     if (event.target.id === "divider") return;
     stage.setPointerCapture(event.pointerId);
@@ -24,7 +23,7 @@ function pointers(app) {
   });
   stage.addEventListener("pointermove", (event) => {
     const before = fingers.get(event.pointerId);
-    if (!before) return;
+    if (!before) { hover(app, event); return; }
     const dx = event.clientX - before[0], dy = event.clientY - before[1];
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     moved += Math.abs(dx) + Math.abs(dy);
@@ -37,7 +36,7 @@ function pointers(app) {
     app.change();
   });
   const up = (event) => {
-    if (fingers.delete(event.pointerId) && moved < 4 && event.type === "pointerup") click(app, event, scale());
+    if (fingers.delete(event.pointerId) && moved < 4 && event.type === "pointerup") click(app, event);
     spread = 0;
   };
   stage.addEventListener("pointerup", up);
@@ -49,11 +48,26 @@ function pointers(app) {
   }, { passive: false });
 }
 
+/** The recorded camera under a pointer, if cameras are shown. */
+function frameUnder(app, event) {
+  if (!app.state.cameras) return null;
+  const box = app.stage.getBoundingClientRect(), [x0, y0] = app.last.area, ratio = app.last.ratio ?? 1;
+  return app.overlayDrawer.frameAt((event.clientX - box.left) * ratio - x0, (event.clientY - box.top) * ratio - y0);
+}
+
+/** A pointer over a recorded camera shows its image. */
+function hover(app, event) {
+  const thumb = document.getElementById("thumb"), frame = frameUnder(app, event), url = frame && app.imageUrl(frame);
+  thumb.hidden = !url;
+  if (!url) return;
+  const box = app.stage.getBoundingClientRect();
+  if (thumb.src !== url) thumb.src = url;
+  Object.assign(thumb.style, { left: `${clamp(event.clientX - box.left, 92, box.width - 92)}px`, top: `${Math.max(140, event.clientY - box.top)}px` });
+}
+
 /** A click on a recorded camera jumps there. */
-function click(app, event, ratio) {
-  if (!app.state.cameras) return;
-  const box = app.stage.getBoundingClientRect(), [x0, y0] = app.last.area;
-  const frame = app.overlayDrawer.frameAt((event.clientX - box.left) * ratio - x0, (event.clientY - box.top) * ratio - y0);
+function click(app, event) {
+  const frame = frameUnder(app, event);
   if (frame) app.change({ mode: "recorded", camera: frame.camera, t: frame.t, shift: 0, up: 0 });
 }
 

@@ -23,7 +23,7 @@ from mudg.data.scene import read_image, read_points
 from mudg.report.page import FAR_M, NEAR_M
 from mudg.report.viewer.packed import Sections, key_rows
 
-WEBP_QUALITY: Final = 60
+WEBP_QUALITY: Final = 50
 REACH_M: Final = 80.0
 
 

@@ -37,6 +37,9 @@ from mudg.models.scene.vibration import VibrationNode
 BLOCK: Final = 256
 LEAD_STEP: Final = 0.1
 """Of class logits; a lead beyond 25.5 is cut."""
+PLACE_STEP_M: Final = 0.0005
+SCALE_STEP: Final = 0.01
+"""Finest steps of places, metres, and of logarithms of scales."""
 ALPHA_MIN: Final = 1 / 255
 """The rasterizer draws no Gaussian below it."""
 SH_BAND_0: Final = 0.28209479177387814
@@ -151,8 +154,8 @@ def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any
     places, sizes = np.zeros((len(rows), 3), np.uint16), np.zeros((len(rows), 3), np.uint8)
     bounds = np.zeros((len(blocks), 12), np.float32)
     for index, (_, own) in enumerate(blocks):
-        bounds[index, :3], bounds[index, 3:6], places[own] = _quantised(means[own], 65535)
-        bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255)
+        bounds[index, :3], bounds[index, 3:6], places[own] = _quantised(means[own], 65535, PLACE_STEP_M)
+        bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255, SCALE_STEP)
     bytes_of = np.concatenate([(places & 255).T, (places >> 8).T]).astype(np.uint8)
     turns = smallest_three(columns["quats"][rows].astype(np.float64))
     return {
@@ -163,10 +166,10 @@ def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any
     }
 
 
-def _quantised(values: NDArray[np.float64], levels: int) -> tuple[Any, Any, Any]:
-    """Least value, step (both as f32 holds them) and levels, per column."""
+def _quantised(values: NDArray[np.float64], levels: int, least_step: float) -> tuple[Any, Any, Any]:
+    """Least value, step (both as f32 holds them) and levels, per column. Few levels leave high bytes that compress well."""
     low = values.min(0).astype(np.float32)
-    step = np.maximum((values.max(0) - low) / levels, 1e-12).astype(np.float32)
+    step = np.maximum((values.max(0) - low) / levels, least_step).astype(np.float32)
     return low, step, np.clip(np.rint((values - low) / step), 0, levels).astype(np.uint16 if levels > 255 else np.uint8)
 
 

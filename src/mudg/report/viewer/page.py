@@ -84,7 +84,7 @@ class ViewerPage:
 
 
 def _gzipped(blob: bytes) -> bytes:
-    return gzip.compress(blob, 6, mtime=0)
+    return gzip.compress(blob, 9, mtime=0)
 
 
 def asset(name: str) -> str:

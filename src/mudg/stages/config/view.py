@@ -22,7 +22,7 @@ class PageConfig:
     """Width of recorded images on the page, pixels (0 = none)."""
     images: int = Field(default=150, ge=0)
     """Most recorded images on the page, taken evenly."""
-    lidar_points: int = Field(default=30_000, ge=0)
+    lidar_points: int = Field(default=20_000, ge=0)
     """Most LiDAR points on the page, taken evenly from all sweeps."""
 
 
