@@ -58,6 +58,11 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         store.write_text(out / "report.html", "page")
         return out / "report.html"
 
+    def write_viewer(out: Path) -> Path:
+        seen["calls"].append("viewer")
+        return out / "viewer.html"
+
+    monkeypatch.setattr(run, "_write_viewer", write_viewer)
     monkeypatch.setattr(run_report, "film", film)
     monkeypatch.setattr(run_report, "write_page", write_page)
     return seen
@@ -65,7 +70,7 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 CHAIN = [
     "ingest", "fuse", "fit:street_gaussians", "synthesize", "fit:mudg_s", "render:street_gaussians", "render:mudg_s",
-    "score", "report",
+    "score", "viewer", "report",
 ]  # fmt: skip
 
 

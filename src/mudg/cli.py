@@ -153,6 +153,18 @@ def _export(args: f.ExportFlags) -> dict[str, Any]:
     return {"exported": made}
 
 
+def _page(args: f.PageFlags) -> dict[str, Any]:
+    from mudg.stages.viewing import view
+
+    return view.run_page(args.settings, args.run, args.out, scene=args.scene, compare=args.compare, overwrite=args.overwrite)
+
+
+def _view(args: f.ViewFlags) -> dict[str, Any]:
+    from mudg.stages.viewing import view
+
+    return view.run_view(args.settings, args.run, args.compare, scene=args.scene)
+
+
 def _score(args: f.Score) -> dict[str, Any]:
     from mudg.stages import score
 
@@ -304,6 +316,17 @@ VERBS: dict[str, Verb] = {
          "mudg export colmap scenes/city --out city_colmap"),
         _export,
     ),
+    "page": Verb(
+        "Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network.",
+        ("mudg page runs/kitti --out kitti.html", "mudg page runs/kitti --compare runs/kitti --out both.html",
+         "mudg page runs/mudg_s --scene scenes/city --out city.html"),
+        _page,
+    ),
+    "view": Verb(
+        "Show a fitted scene in a browser, with exact frames from the rasterizer.",
+        ("mudg view runs/kitti", "mudg view runs/a runs/b", "mudg view runs/mudg_s --scene scenes/city --port 8080"),
+        _view,
+    ),
     "score": Verb(
         "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
@@ -323,6 +346,7 @@ VERBS: dict[str, Verb] = {
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
+    ("look at a drive", ("view", "page")),
     ("change a drive", ("edit", "asset")),
     ("other programs", ("export",)),
     ("benchmarks", ("bench",)),

@@ -240,6 +240,36 @@ class AssetFlags(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PageFlags(Common):
+    """Flags of ``mudg page``."""
+
+    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    out: Annotated[Path, arg(metavar="FILE.html")]
+    """Page to write: one file. Above 32 MB, a folder of the same name without .html, for a web server."""
+    scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    compare: Annotated[Path | None, arg(metavar="RUN2")] = None
+    """A second run or fit of the same log, to compare with. The same run: its two fits."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace the page if it exists."""
+    settings: Annotated[stage_config.PageConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFlags(Common):
+    """Flags of ``mudg view``."""
+
+    run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    compare: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[RUN2]")] = None
+    """A second run or fit of the same log, to compare with. The same run: its two fits."""
+    scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    settings: Annotated[stage_config.ViewConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Score(Output):
     """Flags of ``mudg score``."""
 
@@ -329,7 +359,7 @@ class Doctor(Common):
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
     "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
-    "edit": EditFlags, "asset": AssetFlags, "export": ExportFlags,
+    "edit": EditFlags, "asset": AssetFlags, "export": ExportFlags, "page": PageFlags, "view": ViewFlags,
 }  # fmt: skip
 
 

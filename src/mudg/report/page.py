@@ -82,19 +82,20 @@ class Adaptation:
 
 def page(
     scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str, videos: Sequence[TrajectoryVideo],
-    columns: Sequence[str], adaptation: Adaptation | None = None,
+    columns: Sequence[str], adaptation: Adaptation | None = None, viewer: str = "",
 ) -> str:  # fmt: skip
     """The text of the page.
 
     Args:
         scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
         columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if there was one.
+        viewer: relative address of the page that shows the fitted scene, or empty.
     """
     scene = scores["scene"]
     heading, lead = headline(scores)
     return html.render(
         "report.html.j2", title=f"{scene['id']}: mudg report", kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
-        heading=heading, lead=lead, scene=scene, facts=_facts(scores, ledger), rules=scores["rules"],
+        heading=heading, lead=lead, scene=scene, viewer=viewer, facts=_facts(scores, ledger), rules=scores["rules"],
         methods=scores["methods"], settings=settings, provenance=_provenance(scores, ledger),
         adaptation=None if adaptation is None else adaptation.record,
         adaptation_pictures=() if adaptation is None else adaptation.pictures,

@@ -26,6 +26,7 @@ from mudg.report.panels import panel_grid, panel_size
 PANEL_WIDTH: Final = 416
 BUDGET_BYTES: Final = 16 * 2**20
 """For all videos together, before base64; the page stays under 25 MB."""
+VIEWER: Final = "viewer.html"
 SAME_TIME_S: Final = 1e-4
 ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
 ENCODING: Final = Encoding(FPS, first_crf=27, last_crf=45, preset="veryfast")
@@ -63,14 +64,15 @@ def film(out: Path) -> list[TrajectoryVideo]:
 
 
 def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
-    """The cheap half: scores, times and settings around the videos."""
+    """The cheap half: scores, times and settings around the videos, and a link to the viewer page if there is one."""
     out = Path(out)
     scores = store.read_json(out / "score" / "metrics.json")
     ledger = store.read_json(out / "run.json")
     settings = out / "run.yaml"
     text = store.read_text(settings) if settings.is_file() else ""
     columns = list(_folders(out, scores))
-    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt")))
+    viewer = VIEWER if (out / VIEWER).is_file() else ""
+    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt"), viewer))
     return out / "report.html"
 
 

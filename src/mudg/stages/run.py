@@ -1,7 +1,7 @@
 """The chain behind ``mudg demo`` and ``mudg run``: every verb in order, each skipped when its result verifies.
 
 OUT/scene  OUT/fuse  OUT/adapt  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>  OUT/score
-OUT/report.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
+OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
 """
 
 from __future__ import annotations
@@ -82,6 +82,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         for step in _steps(config, scene, out, overwrite):
             ledger.timed(step)
         key = _report_key(out)
+        if not ledger.has_report(key):
+            ledger.timed(Step("viewer", "viewer.html", lambda: _write_viewer(out)))
         reels = None if ledger.has_report(key) else ledger.timed(Step("report", "report.html", lambda: run_report.film(out)))
     except KeyboardInterrupt:
         ledger.save("interrupted")
@@ -99,6 +101,15 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
         "text": _closing_text(out, page, ledger),
     }  # fmt: skip
+
+
+def _write_viewer(out: Path) -> Path:
+    """Write the page that shows the fitted scene in a browser."""
+    from mudg.report.run_report import VIEWER
+    from mudg.stages.config import PageConfig
+    from mudg.stages.viewing import view
+
+    return view.run_page(PageConfig(), out, out / VIEWER, report="report.html", overwrite=True)["page"]
 
 
 def _refuse_missing(config: RunConfig) -> None:

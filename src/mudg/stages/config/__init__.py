@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, chosen_preset, run_preset
     from mudg.stages.config.run import RunConfig, on_device, with_device, with_lines, with_seed
     from mudg.stages.config.synthesize import SynthesizeConfig
+    from mudg.stages.config.view import PageConfig, ViewConfig
     from mudg.stages.config.views import RenderConfig, ScoreConfig
 
 _HOMES = {
@@ -48,6 +49,8 @@ _HOMES = {
     "with_lines": "mudg.stages.config.run",
     "with_seed": "mudg.stages.config.run",
     "SynthesizeConfig": "mudg.stages.config.synthesize",
+    "PageConfig": "mudg.stages.config.view",
+    "ViewConfig": "mudg.stages.config.view",
     "RenderConfig": "mudg.stages.config.views",
     "ScoreConfig": "mudg.stages.config.views",
 }
@@ -67,11 +70,13 @@ __all__ = [
     "ImportConfig",
     "IngestConfig",
     "LearnConfig",
+    "PageConfig",
     "PresetName",
     "RenderConfig",
     "RunConfig",
     "ScoreConfig",
     "SynthesizeConfig",
+    "ViewConfig",
     "chosen_preset",
     "on_device",
     "run_preset",

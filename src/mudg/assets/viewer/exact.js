@@ -1,0 +1,30 @@
+// Behind `mudg view` stands a server that draws with the program's own rasterizer. When the camera rests, its frame replaces the page's.
+
+/** Asks for exact frames whenever the camera rests. */
+export function exactFrames(app) {
+  const { live } = app.facts, badge = document.getElementById("exact");
+  if (!live) return;
+  let current = null;
+  app.onRest = async () => {
+    const s = app.state;
+    if (!live.layers.includes(s.layer)) return;
+    current?.abort();
+    current = new AbortController();
+    const view = app.last.view, asked = app.changed;
+    const body = { scene: s.scene, layer: s.layer, time_s: s.t + app.facts.begin_s, hidden: [...s.hidden], camera: s.mode === "recorded" ? s.camera : "",
+      width: view.width, height: view.height, fx: view.fx, fy: view.fy, cx: view.cx, cy: view.cy, eye: view.eye, axes: view.axes };
+    try {
+      const answer = await fetch("frame", { method: "POST", headers: { "Content-Type": "application/json", "X-Mudg-Token": live.token }, body: JSON.stringify(body), signal: current.signal });
+      if (!answer.ok) throw new Error(await answer.text());
+      const image = await createImageBitmap(await answer.blob(), { colorSpaceConversion: "none" });
+      if (app.changed !== asked) return; // the camera has moved on
+      app.exact = { key: `exact ${asked}`, image };
+      app.draw(1, false);
+      app.sharp = true;
+      badge.hidden = false;
+    } catch (error) {
+      if (error.name !== "AbortError") document.getElementById("note").textContent = `No exact frame: ${error.message}`;
+    }
+  };
+  app.listeners.add(() => { badge.hidden = true; });
+}

@@ -1,0 +1,27 @@
+// Starts the page: reads its facts, unpacks, shows the controls; says what is wrong where it cannot.
+
+import { App } from "mudg/app";
+import { exactFrames } from "mudg/exact";
+import { listen } from "mudg/input";
+import { Controls } from "mudg/ui";
+
+const $ = (id) => document.getElementById(id);
+
+async function start() {
+  const facts = JSON.parse($("facts").textContent);
+  const app = new App(facts, { canvas: $("canvas"), overlay: $("overlay"), stage: $("stage") });
+  await app.load((share) => { $("progress").value = share; });
+  exactFrames(app);
+  listen(app, new Controls(app));
+  $("loading").hidden = true;
+  window.mudg = app; // for tests, and for the curious
+  document.documentElement.dataset.ready = "yes";
+}
+
+start().catch((error) => {
+  $("loading").hidden = false;
+  $("progress").hidden = true;
+  $("problem").textContent = `The scene cannot be shown: ${error.message} The videos of the report need no graphics card.`;
+  document.documentElement.dataset.problem = error.message;
+  throw error;
+});

@@ -1,0 +1,144 @@
+// Boxes, paths, LiDAR points and recorded cameras, drawn over the picture. They are not hidden by what stands before them.
+
+import { add, project, turn } from "mudg/math";
+
+const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const NEAREST = 0.25;
+
+/** A colour that belongs to a track, the same on every page. */
+export function trackColor(id) {
+  let hash = 0;
+  for (const letter of id) hash = (hash * 31 + letter.codePointAt(0)) >>> 0;
+  return `hsl(${hash % 360} 85% 62%)`;
+}
+
+export class Overlay {
+  /** @param tracks [{id, label, size_m, pose: PoseKeys}]. @param sweeps [{t, points: Float32Array}] in the world. */
+  constructor(canvas, tracks, sweeps, drive) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d");
+    Object.assign(this, { tracks, sweeps, drive });
+    this.thumbnails = []; // where recorded cameras were drawn: {x, y, frame}
+  }
+
+  /** Draws what the state asks for. @param area of the picture in the canvas, from its upper left corner: [x, y, width, height]. */
+  draw(view, area, state, ratio) {
+    const c = this.context;
+    c.setTransform(1, 0, 0, 1, 0, 0);
+    c.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    this.thumbnails = [];
+    if (!(state.boxes || state.paths || state.lidar || state.cameras || state.selected)) return;
+    c.save();
+    c.beginPath();
+    c.rect(...area);
+    c.clip();
+    c.translate(area[0], area[1]);
+    this.ratio = ratio;
+    if (state.lidar) this.points(view, state.t);
+    if (state.cameras) this.frustums(view, state);
+    for (const track of this.tracks) {
+      const chosen = state.selected === track.id;
+      if (state.paths || chosen) this.path(view, track, state.t);
+      if (state.boxes || chosen) this.box(view, track, state.t, chosen);
+    }
+    if (state.paths) this.line(view, this.drive.ego.positions, "rgb(255 255 255 / .8)", 2);
+    c.restore();
+  }
+
+  line(view, points, color, width, dash = []) {
+    const c = this.context;
+    c.strokeStyle = color;
+    c.lineWidth = width * this.ratio;
+    c.setLineDash(dash.map((v) => v * this.ratio));
+    c.beginPath();
+    let down = false;
+    for (const point of points) {
+      const [x, y, z] = project(view, point);
+      if (z < NEAREST) { down = false; continue; }
+      if (down) c.lineTo(x, y); else c.moveTo(x, y);
+      down = true;
+    }
+    c.stroke();
+    c.setLineDash([]);
+  }
+
+  path(view, track, t) {
+    const { times, positions } = track.pose, color = trackColor(track.id), here = track.pose.at(t)?.position;
+    const past = positions.filter((_, i) => times[i] <= t), future = positions.filter((_, i) => times[i] >= t);
+    this.line(view, here ? [...past, here] : past, color, 2.5);
+    this.line(view, here ? [here, ...future] : future, color, 1.5, [5, 4]);
+  }
+
+  box(view, track, t, chosen) {
+    const pose = track.pose.at(t);
+    if (!pose) return;
+    const half = track.size_m.map((v) => v / 2), c = this.context, color = trackColor(track.id);
+    const corners = Array.from({ length: 8 }, (_, k) => project(view, add(pose.position,
+      turn(pose.rotation, [(k & 4 ? 1 : -1) * half[0], (k & 2 ? 1 : -1) * half[1], (k & 1 ? 1 : -1) * half[2]]))));
+    if (corners.some((corner) => corner[2] < NEAREST)) return;
+    c.strokeStyle = color;
+    c.lineWidth = (chosen ? 3 : 1.5) * this.ratio;
+    c.beginPath();
+    for (const [a, b] of EDGES) { c.moveTo(corners[a][0], corners[a][1]); c.lineTo(corners[b][0], corners[b][1]); }
+    c.stroke();
+    c.fillStyle = color.replace(")", " / .22)"); // the front face
+    c.beginPath();
+    for (const k of [4, 5, 7, 6]) c.lineTo(corners[k][0], corners[k][1]);
+    c.fill();
+    const top = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best));
+    const speed = track.pose.speed(t), text = `${track.id} ${track.label}${speed > 0.2 ? ` ${(speed * 3.6).toFixed(0)} km/h` : ""}`;
+    c.font = `${12 * this.ratio}px system-ui, sans-serif`;
+    const wide = c.measureText(text).width;
+    c.fillStyle = "rgb(12 14 18 / .78)";
+    c.fillRect(top[0] - wide / 2 - 4 * this.ratio, top[1] - 19 * this.ratio, wide + 8 * this.ratio, 16 * this.ratio);
+    c.fillStyle = color;
+    c.fillText(text, top[0] - wide / 2, top[1] - 7 * this.ratio);
+  }
+
+  points(view, t) {
+    if (!this.sweeps.length) return;
+    const sweep = this.sweeps.reduce((best, one) => (Math.abs(one.t - t) < Math.abs(best.t - t) ? one : best)), c = this.context, p = sweep.points;
+    for (let i = 0; i < p.length; i += 3) {
+      const [x, y, z] = project(view, [p[i], p[i + 1], p[i + 2]]);
+      if (z < NEAREST || x < 0 || y < 0 || x > view.width || y > view.height) continue;
+      const size = Math.max(1.2, Math.min(4, 24 / z)) * this.ratio;
+      c.fillStyle = `hsl(${Math.max(0, 250 - 5 * z)} 90% 60%)`;
+      c.fillRect(x - size / 2, y - size / 2, size, size);
+    }
+  }
+
+  frustums(view, state) {
+    const c = this.context;
+    for (const [name, frames] of Object.entries(this.drive.frames)) {
+      const camera = this.drive.facts.cameras[name];
+      for (const frame of frames) {
+        const m = frame.pose, eye = [m[3], m[7], m[11]], chosen = name === state.camera && Math.abs(frame.t - state.t) < 0.04;
+        const corners = [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]].map(([u, v]) => {
+          const ray = [(u - camera.cx) / camera.fx * 0.5, (v - camera.cy) / camera.fy * 0.5, 0.5];
+          return project(view, [0, 1, 2].map((k) => m[4 * k] * ray[0] + m[4 * k + 1] * ray[1] + m[4 * k + 2] * ray[2] + eye[k]));
+        });
+        const tip = project(view, eye);
+        if (tip[2] < 1 || corners.some((corner) => corner[2] < NEAREST)) continue;
+        c.strokeStyle = chosen ? "#ffd54a" : "rgb(120 190 255 / .75)";
+        c.lineWidth = (chosen ? 2.5 : 1) * this.ratio;
+        c.beginPath();
+        for (const corner of corners) { c.moveTo(tip[0], tip[1]); c.lineTo(corner[0], corner[1]); }
+        c.moveTo(corners[3][0], corners[3][1]);
+        for (const corner of corners) c.lineTo(corner[0], corner[1]);
+        c.stroke();
+        const mean = [0, 1].map((k) => corners.reduce((sum, corner) => sum + corner[k], 0) / 4);
+        this.thumbnails.push({ x: mean[0], y: mean[1], frame });
+      }
+    }
+  }
+
+  /** The recorded camera that is drawn at a place of the picture. */
+  frameAt(x, y, reach = 14) {
+    let best = null, least = (reach * this.ratio) ** 2;
+    for (const one of this.thumbnails) {
+      const d = (one.x - x) ** 2 + (one.y - y) ** 2;
+      if (d < least) { least = d; best = one.frame; }
+    }
+    return best;
+  }
+}

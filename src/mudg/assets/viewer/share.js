@@ -1,0 +1,59 @@
+// What leaves the page: pictures, videos, links.
+
+import { scaled } from "mudg/app";
+import { toHash } from "mudg/state";
+
+const MOST_SIDE = 8192;
+
+function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
+
+/** Saves what is shown as PNG, `times` as large; boxes and points are drawn on it as on the page. */
+export function savePicture(app, times) {
+  const { canvas, overlay, renderer, state } = app, whole = app.last.view, factor = Math.min(times, MOST_SIDE / Math.max(whole.width, whole.height));
+  const before = [canvas.width, canvas.height], view = scaled(whole, factor), { left, right, mode } = app.used();
+  Object.assign(canvas, { width: view.width, height: view.height });
+  const area = [0, 0, view.width, view.height];
+  renderer.present(app.pictureOf("left", left, view) ?? app.pictureOf("left", left, view, "color"),
+    right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null, area, mode, state.divider);
+  const sheet = Object.assign(document.createElement("canvas"), { width: view.width, height: view.height }), c = sheet.getContext("2d");
+  c.drawImage(canvas, 0, 0);
+  c.drawImage(overlay, ...app.last.area, 0, 0, view.width, view.height);
+  Object.assign(canvas, { width: before[0], height: before[1] });
+  app.change();
+  return new Promise((resolve) => sheet.toBlob((blob) => { save(blob, nameOf(app, "png")); resolve(blob.size); }, "image/png"));
+}
+
+/** Plays the drive once and records the picture; the browser encodes it. */
+export function recordVideo(app, say) {
+  if (!("MediaRecorder" in window) || !app.canvas.captureStream) return say("This browser cannot record videos.");
+  const kind = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"].find((one) => MediaRecorder.isTypeSupported(one));
+  if (!kind) return say("This browser has no video encoder.");
+  const recorder = new MediaRecorder(app.canvas.captureStream(30), { mimeType: kind, videoBitsPerSecond: 8e6 }), parts = [];
+  const { loop } = app.state;
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  recorder.onstop = () => { app.change({ loop }); save(new Blob(parts, { type: kind }), nameOf(app, kind.includes("mp4") ? "mp4" : "webm")); say("Video saved."); };
+  const watch = () => { if (!app.state.playing) { app.listeners.delete(watch); setTimeout(() => recorder.stop(), 200); } };
+  app.change({ t: 0, playing: true, loop: false });
+  recorder.start();
+  app.listeners.add(watch);
+  say("Recording. Pause to end it.");
+}
+
+/** Puts a link to what is shown into the clipboard. */
+export async function saveLink(app) {
+  history.replaceState(null, "", toHash(app.state));
+  try {
+    await navigator.clipboard.writeText(location.href);
+    return "Link copied.";
+  } catch {
+    return "The link is in the address bar.";
+  }
+}

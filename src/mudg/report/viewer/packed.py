@@ -1,0 +1,261 @@
+"""A fitted scene as few bytes as a browser needs to draw it: quantised per block of neighbours, laid out as planes, one blob.
+
+Rows are ordered by node, within a node along a Morton curve, and cut into blocks of at most `BLOCK` rows. Sections of the blob
+(little-endian; every one starts at a multiple of 4; n rows, b blocks):
+
+    block     f32[b, 12]   least position [3], step [3]; least natural logarithm of the scale [3], step [3]
+    block_of  u32[b, 2]    node and rows of each block
+    position  u8[6, n]     x y z low bytes, then x y z high bytes: least + value * step, metres, frame of the node
+    scale     u8[3, n]     least + value * step, natural logarithm of metres
+    rotation  u8[4, n]     bytes of a u32: the three smaller parts of the unit quaternion (w x y z) as 10 bits each, offset 512, and in
+                           the highest two bits which part is left out; it is positive
+    color     u8[4, n]     r g b of the constant band, between ``color_low`` and ``color_high``; opacity of 255
+    class     u8[2, n]     channel of the likeliest class (255: none), and its lead over the second in `LEAD_STEP`
+    certainty u8[n]        of 255 (only if it was measured)
+    harmonics u8[3 (K - 1), n]   further bands, (value - 128) * ``harmonic_step`` (only above degree 0)
+    sky       u8[rows, 2 rows, 3]   panorama between 0 and 1 (only if there is one)
+    keys, deform: see ``motion_sections``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry
+from mudg.models.scene.bezier import BezierNode
+from mudg.models.scene.deformed import DeformedNode
+from mudg.models.scene.hexplane import HexPlaneNode
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import DeformableNode, RigidNode
+from mudg.models.scene.vibration import VibrationNode
+
+BLOCK: Final = 256
+LEAD_STEP: Final = 0.1
+"""Of class logits; a lead beyond 25.5 is cut."""
+PLACE_STEP_M: Final = 0.0005
+SCALE_STEP: Final = 0.01
+"""Finest steps of places, metres, and of logarithms of scales."""
+ALPHA_MIN: Final = 1 / 255
+"""The rasterizer draws no Gaussian below it."""
+SH_BAND_0: Final = 0.28209479177387814
+COLOR_LIMITS: Final = (-0.5, 2.0)
+"""Colours of Gaussians beyond these are cut; a Gaussian may be darker than black or brighter than white where others cover it."""
+
+Sections = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """A scene for the page.
+
+    Args:
+        sections: see the module's docstring. facts: JSON values that describe them.
+        given: Gaussians of the fit. kept: of the page.
+        notes: sentences about what the page shows differently from the rasterizer.
+    """
+
+    sections: Sections
+    facts: dict[str, Any]
+    given: int
+    kept: int
+    notes: tuple[str, ...]
+
+
+def pack_scene(model: SceneModel, begin_s: float, path: NDArray[np.floating] | None = None, most: int = 0) -> Packed:
+    """Quantise a fitted scene.
+
+    Args:
+        model: on the CPU. begin_s: time that becomes 0 in all sections, seconds.
+        path: positions of the cameras f64[m, 3]; which Gaussians are worth keeping depends on how near they are.
+        most: number of Gaussians to keep (0 = all that can be drawn).
+    """
+    columns = {name: value.detach().float().numpy() for name, value in model.table.columns.items()}
+    node = model.table.labels["node"].numpy().astype(np.int64)
+    opacity = 1 / (1 + np.exp(-columns["logits"].astype(np.float64)))
+    rows = np.flatnonzero(opacity >= ALPHA_MIN)
+    if most and len(rows) > most:
+        worth = _worth(columns, opacity, node, path)[rows]
+        rows = np.sort(rows[np.argsort(-worth, kind="stable")[:most]])
+    rows = rows[np.lexsort((morton_codes(columns["means"][rows], node[rows]), node[rows]))]
+    blocks = list(_blocks(node[rows]))
+    facts: dict[str, Any] = {
+        "rows": len(rows),
+        "degree": model.sh_degree,
+        "classes": list(model.classes),
+        "lead_step": LEAD_STEP,
+    }
+    sections = _geometry(columns, rows, blocks) | {"block_of": np.array([(n, len(b)) for n, b in blocks], np.uint32)}
+    low, high, sections["color"] = _colors(columns["sh_dc"][rows, 0], opacity[rows], model.sh_degree)
+    facts |= {"color_low": low, "color_high": high}
+    sections["class"] = _classes(columns.get("semantics"), rows)
+    if model.certainty is not None:
+        sections["certainty"] = to_u8(model.certainty.float().numpy()[rows])
+    if model.sh_degree:
+        facts["harmonic_step"], sections["harmonics"] = _harmonics(columns["sh_rest"][rows])
+    if model.sky is not None:
+        panorama = model.sky.table["panorama"].detach()[0].numpy()
+        sections["sky"] = to_u8(panorama.transpose(1, 2, 0))
+        facts["sky_rows"] = model.sky.rows
+    facts["nodes"], moving = motion_sections(model, begin_s)
+    return Packed(sections | moving, facts, len(node), len(rows), _notes(model))
+
+
+def _notes(model: SceneModel) -> tuple[str, ...]:
+    inexact = (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)
+    if any(isinstance(node, inexact) for node in model.nodes):
+        return (
+            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them.",
+        )
+    return ()
+
+
+def _worth(columns: Mapping[str, Any], opacity: Any, node: Any, path: Any) -> NDArray[np.float64]:
+    """Opacity times the area that a Gaussian covers in an image taken where the path is nearest. What moves counts as 10 m away."""
+    two = np.sort(columns["log_scales"], 1)[:, 1:].sum(1).astype(np.float64)
+    distance2 = np.full(len(two), 100.0)
+    if path is not None and len(path):
+        from scipy.spatial import cKDTree
+
+        still = node == 0
+        distance2[still] = cKDTree(path).query(columns["means"][still])[0] ** 2
+    return opacity * np.exp(two) / np.maximum(distance2, 1.0)
+
+
+def morton_codes(means: NDArray[np.floating], node: NDArray[np.integer]) -> NDArray[np.uint64]:
+    """Places along a space-filling curve through each node's own box: u64[n], 16 bits per axis."""
+    codes = np.zeros(len(means), np.uint64)
+    for one in np.unique(node):
+        here = node == one
+        low, high = means[here].min(0), means[here].max(0)
+        cell = ((means[here] - low) / np.maximum(high - low, 1e-9) * 65535).astype(np.uint64)
+        mixed = np.zeros(len(cell), np.uint64)
+        for bit in range(16):
+            for axis in range(3):
+                mixed |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+        codes[here] = mixed
+    return codes
+
+
+def _blocks(node: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Node and positions of every block; rows are ordered by node."""
+    for one in np.unique(node):
+        own = np.flatnonzero(node == one)
+        for start in range(0, len(own), BLOCK):
+            yield int(one), own[start : start + BLOCK]
+
+
+def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any]]) -> Sections:
+    means, scales = columns["means"][rows].astype(np.float64), columns["log_scales"][rows].astype(np.float64)
+    places, sizes = np.zeros((len(rows), 3), np.uint16), np.zeros((len(rows), 3), np.uint8)
+    bounds = np.zeros((len(blocks), 12), np.float32)
+    for index, (_, own) in enumerate(blocks):
+        bounds[index, :3], bounds[index, 3:6], places[own] = _quantised(means[own], 65535, PLACE_STEP_M)
+        bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255, SCALE_STEP)
+    bytes_of = np.concatenate([(places & 255).T, (places >> 8).T]).astype(np.uint8)
+    turns = smallest_three(columns["quats"][rows].astype(np.float64))
+    return {
+        "block": bounds,
+        "position": bytes_of,
+        "scale": sizes.T.copy(),
+        "rotation": turns.view(np.uint8).reshape(-1, 4).T.copy(),
+    }
+
+
+def _quantised(values: NDArray[np.float64], levels: int, least_step: float) -> tuple[Any, Any, Any]:
+    """Least value, step (both as f32 holds them) and levels, per column. Few levels leave high bytes that compress well."""
+    low = values.min(0).astype(np.float32)
+    step = np.maximum((values.max(0) - low) / levels, least_step).astype(np.float32)
+    return low, step, np.clip(np.rint((values - low) / step), 0, levels).astype(np.uint16 if levels > 255 else np.uint8)
+
+
+def smallest_three(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """Quaternions [n, 4] (w x y z, any length) as u32[n]."""
+    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+    unit[np.abs(unit).max(1) == 0] = (1, 0, 0, 0)
+    largest = np.abs(unit).argmax(1)
+    unit *= np.where(np.take_along_axis(unit, largest[:, None], 1) < 0, -1.0, 1.0)
+    others = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    level = (np.clip(np.rint(others * np.sqrt(2) * 511), -511, 511) + 512).astype(np.uint32)
+    return level[:, 0] | level[:, 1] << 10 | level[:, 2] << 20 | largest.astype(np.uint32) << 30
+
+
+def _colors(bands: Any, opacity: Any, degree: int) -> tuple[float, float, NDArray[np.uint8]]:
+    rgb = bands * SH_BAND_0 + 0.5
+    low = (
+        max(float(rgb.min(initial=0)), COLOR_LIMITS[0]) if degree else 0.0
+    )  # without further bands what is below 0 is drawn as 0
+    high = min(max(float(rgb.max(initial=1)), 1.0), COLOR_LIMITS[1])
+    level = to_u8((rgb - low) / (high - low))
+    return low, high, np.concatenate([level.T, to_u8(opacity)[None]])
+
+
+def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
+    if logits is None or logits.shape[1] < 2:
+        return np.stack([np.full(len(rows), 255, np.uint8), np.zeros(len(rows), np.uint8)])
+    here = logits[rows]
+    best = np.partition(here, -2, axis=1)[:, -2:]
+    lead = np.clip(np.rint((best[:, 1] - best[:, 0]) / LEAD_STEP), 1, 255)
+    return np.stack([here.argmax(1), lead]).astype(np.uint8)
+
+
+def _harmonics(rest: Any) -> tuple[float, NDArray[np.uint8]]:
+    flat = rest.reshape(len(rest), -1)
+    step = max(float(np.percentile(np.abs(flat), 99.95)) if flat.size else 0.0, 1e-6) / 127
+    return step, (np.clip(np.rint(flat / step), -127, 127) + 128).astype(np.uint8).T.copy()
+
+
+def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Values in [0, 1] as u8; what lies outside is cut."""
+    return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+# motion ---------------------------------------------------------------------------------------------------------------
+
+
+def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, Any]], Sections]:
+    """What carries the rows of each node.
+
+    Returns:
+        One record per node (name, kind, label, size_m, ``keys``: first row and number of its keys in section "keys", ``grid``: first
+        value and cells of its displacements in "deform"), and the sections: ``keys`` f32[k, 8] (time since ``begin_s``, position,
+        quaternion w x y z, world from box), ``deform`` f32[...] as [key, xyz, z, y, x] per deformable node, metres.
+    """
+    records, keys, grids = [], [np.zeros((0, 8), np.float32)], [np.zeros(0, np.float32)]
+    for node in model.nodes:
+        record: dict[str, Any] = {"name": node.name, "kind": node.kind}
+        if isinstance(node, RigidNode):
+            record |= {"label": node.label, "size_m": [round(float(v), 4) for v in node.size_m],
+                       "keys": [sum(map(len, keys)), len(node.times_s)]}  # fmt: skip
+            keys.append(key_rows(node.times_s - begin_s, node.corrected_keys()))
+            if isinstance(node, DeformableNode):
+                grid = node.offsets["deform"].detach().float().numpy()
+                record["grid"] = [sum(map(len, grids)), list(grid.shape)]
+                grids.append(grid.reshape(-1))
+        records.append(record)
+    return records, {"keys": np.concatenate(keys), "deform": np.concatenate(grids)}
+
+
+def key_rows(times_s: NDArray[np.floating], poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Poses [k, 4, 4] at times as f32[k, 8]: time, position, quaternion (w x y z)."""
+    turns = np.array([geometry.quaternion_from_matrix(pose) for pose in poses]).reshape(-1, 4)
+    return np.column_stack([np.asarray(times_s), poses[:, :3, 3], turns]).astype(np.float32)
+
+
+# the blob -------------------------------------------------------------------------------------------------------------
+
+
+def blob_of(sections: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, list[Any]]]:
+    """All sections behind one another, and the directory: name -> offset in bytes, type, number of values."""
+    parts, directory, at = [], {}, 0
+    for name, values in sections.items():
+        content = np.ascontiguousarray(values).tobytes()
+        directory[name] = [at, values.dtype.str.lstrip("<|="), int(values.size)]
+        padded = content + b"\0" * (-len(content) % 4)
+        parts.append(padded)
+        at += len(padded)
+    return b"".join(parts), directory

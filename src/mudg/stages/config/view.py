@@ -1,0 +1,50 @@
+"""Settings of ``mudg page`` and ``mudg view``."""
+
+from __future__ import annotations
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from mudg.base.config import STRICT
+from mudg.base.devices import DeviceName
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class PageConfig:
+    """What a viewer page holds."""
+
+    method: str = ""
+    """Fit of a run to show (empty = the best one: mudg_s, else street_gaussians)."""
+    budget: int = Field(default=3_000_000, ge=0)
+    """Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and
+    faintest are left out."""
+    image_width_px: int = Field(default=320, ge=0)
+    """Width of recorded images on the page, pixels (0 = none)."""
+    images: int = Field(default=150, ge=0)
+    """Most recorded images on the page, taken evenly."""
+    lidar_points: int = Field(default=20_000, ge=0)
+    """Most LiDAR points on the page, taken evenly from all sweeps."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ViewConfig(PageConfig):
+    """What ``mudg view`` shows, and where."""
+
+    budget: int = Field(default=0, ge=0)
+    """Most Gaussians on the page (0 = all)."""
+    image_width_px: int = Field(default=640, ge=0)
+    """Width of recorded images on the page, pixels (0 = none)."""
+    port: int = Field(default=0, ge=0, le=65535)
+    """Port to listen on (0 = any free one)."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Any other than this machine's own loopback needs --token."""
+    token: str = ""
+    """Secret that the address of the page carries; who does not know it gets nothing (empty: a random one on the loopback address)."""
+    browser: bool = True
+    """Open the page in a browser where there is one."""
+    exact: bool = True
+    """Draw frames with the rasterizer when the camera rests."""
+    width_px: int = Field(default=1600, ge=16, le=8192)
+    """Widest exact frame, pixels."""
+    device: DeviceName = "auto"
+    """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""

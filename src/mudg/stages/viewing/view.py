@@ -1,0 +1,208 @@
+"""``mudg page``: a fitted scene as a page that anyone can open. ``mudg view``: the same page from a server on this machine, with exact
+frames where the camera rests. The page is ``assets/viewer``; what it is made of, ``report/viewer``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.records import parse_record
+from mudg.base.run_folder import refuse_overlap
+from mudg.base.types import Scene
+from mudg.core.raster.place import drawing_device
+from mudg.data.scene import read_scene
+from mudg.models.scene.model import SceneModel
+from mudg.report.viewer.facts import begin_of, log_facts
+from mudg.report.viewer.packed import Packed, pack_scene
+from mudg.report.viewer.page import ONE_FILE_BYTES, ViewerPage
+from mudg.stages.config.view import PageConfig, ViewConfig
+from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.fitting.storage import load_model, model_of_scene
+from mudg.stages.viewing.frames import LAYERS, FrameRequest, FrameSource
+from mudg.stages.viewing.server import Site, address_of, open_server, show, token_for
+
+NAMES: Final = {"mudg_s": "with diffusion", "street_gaussians": "without diffusion"}
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What a page shows: the log, and one or two fits to it by name."""
+
+    scene: Scene
+    fits: tuple[tuple[str, SceneModel], ...]
+
+
+def run_page(
+    config: PageConfig, run: Path, out: Path, *, scene: Path | None = None, compare: Path | None = None, report: str = "",
+    overwrite: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Write the page of a run or a fit.
+
+    Args:
+        run: a folder of ``mudg run``, or of ``mudg fit`` with ``scene``. out: the file to write. compare: another run or fit of the same
+            log. report: address of the run's report, relative to the page.
+
+    Returns:
+        ``page``: the file (of a folder, its ``index.html``); ``bytes``: of everything; ``gaussians``: on the page; ``text``.
+
+    Raises:
+        UsageError: the output exists, or is an input. InputError: no fitted scene, or another log.
+    """
+    out = Path(out)
+    refuse_overlap(out, {"run": run if not _inside(out, run) else None, "scene": scene, "compare": compare})
+    if out.suffix != ".html":
+        raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
+    folder = out.with_suffix("")
+    for path in (out, folder):
+        if path.exists() and not overwrite:
+            raise UsageError("the output exists", where=str(path), remedy="choose another --out, or add --overwrite")
+    shown = find_shown(config, run, scene, compare)
+    page = page_of(config, shown, report=report)
+    data, facts = page.build()
+    kept = [packed.kept for _, packed in page.scenes]
+    size = sum(map(len, data.values())) * 4 // 3
+    whole = size <= ONE_FILE_BYTES
+    log.info(budget_text(page, data, out if whole else folder / "index.html"))
+    if whole:
+        content = page.one_file(data, facts)
+        store.atomic_write(out, content)
+        return {
+            "page": out,
+            "bytes": len(content),
+            "gaussians": kept,
+            "text": f"page: {out.resolve()} ({len(content) / 1e6:.1f} MB)",
+        }
+    files = page.folder(data, facts)
+    for name, content in files.items():
+        store.atomic_write(folder / name, content)
+    total = sum(map(len, files.values()))
+    text = f"page: {(folder / 'index.html').resolve()} ({total / 1e6:.1f} MB; needs a web server: mudg view, or python -m http.server)"
+    return {"page": folder / "index.html", "bytes": total, "gaussians": kept, "text": text}
+
+
+def _inside(out: Path, run: Path) -> bool:
+    """Whether the page goes into the run's own folder, beside its report, where it overwrites nothing that was read."""
+    return Path(out).resolve().parent == Path(run).resolve() and not (Path(run) / "model.json").is_file()
+
+
+def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Shown:
+    """The log and the fits that a page is to show.
+
+    Raises:
+        InputError: no fitted scene, no log, or fits of different logs. UsageError: a fit has no scene of its own and none was given.
+    """
+    parts = find_run(run)
+    place = scene or parts.scene
+    if place is None:
+        raise UsageError(
+            "a fit alone does not know its log",
+            where=str(run),
+            remedy="add --scene FOLDER, or give the folder of a run",
+        )
+    loaded = read_scene(place)
+    fits = [_fit_of(parts, config.method, loaded)]
+    if compare is not None:
+        others = find_run(compare)
+        same = (
+            config.method
+            if Path(compare).resolve() != Path(run).resolve()
+            else next((n for n in others.fits if n != fits[0][0]), "")
+        )
+        fits.append(_fit_of(others, same, loaded))
+    return Shown(loaded, tuple(fits))
+
+
+def _fit_of(parts: RunParts, method: str, scene: Scene) -> tuple[str, SceneModel]:
+    if method and parts.whole and method not in parts.fits:
+        raise UsageError("the run has no such fit", where="--method", expected=", ".join(parts.fits), got=method)
+    folder = parts.fits[method] if method in parts.fits else parts.model
+    model = model_of_scene(folder, scene) if not parts.whole else load_model(folder)
+    if model.facts.get("scene", scene.id) != scene.id:
+        raise InputError(
+            "fits of different logs cannot be compared",
+            where=str(folder),
+            expected=scene.id,
+            got=str(model.facts["scene"]),
+        )
+    return str(model.facts.get("method", "fit")), model
+
+
+def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, Any] | None = None) -> ViewerPage:
+    """The page of what is shown."""
+    scene, begin = shown.scene, begin_of(shown.scene)
+    path = np.stack([frame.view.center_world for frame in scene.frames])
+    packed = [(name, pack_scene(model, begin, path, config.budget)) for name, model in shown.fits]
+    facts = log_facts(scene, shown.fits[0][1].colors, config.image_width_px, config.images, config.lidar_points)
+    first = packed[0][1]
+    return ViewerPage(
+        title=scene.id, subtitle=", ".join(f"{name} ({NAMES[name]})" if name in NAMES else name for name, _ in packed),
+        about=about_text(scene, first), report=report, scenes=packed, log=facts, live=live,
+    )  # fmt: skip
+
+
+def about_text(scene: Scene, packed: Packed) -> str:
+    """A few sentences on the page."""
+    left = packed.given - packed.kept
+    return (
+        f"{packed.kept:,} Gaussians{f' of {packed.given:,}' if left else ''}, {len(scene.frames)} recorded frames of "
+        f"{len(scene.cameras)} cameras, {len(scene.tracks)} tracked objects. Places, sizes and colours are rounded "
+        f"for the page. Data: {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing and sends nothing."
+    )
+
+
+def budget_text(page: ViewerPage, data: dict[str, bytes], out: Path) -> str:
+    """What the page will take, before it is written."""
+    parts = [
+        f"{name.replace('scene-', 'scene ')} {len(content) / 1e6:.2f} MB" for name, content in data.items() if content
+    ]
+    counts = [f"{packed.kept:,} of {packed.given:,} Gaussians" for _, packed in page.scenes]
+    return f"page {out}: {'; '.join(counts)}; {', '.join(parts)}"
+
+
+def run_view(
+    config: ViewConfig, run: Path, compare: Path | None = None, *, scene: Path | None = None
+) -> dict[str, Any]:
+    """Serve the page of a run until it is interrupted.
+
+    Raises:
+        UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As ``run_page``.
+    """
+    server, site = server_of(config, run, compare, scene)
+    address = address_of(server, site)
+    log.info(f"viewer: {address}   (Ctrl-C ends it)")
+    show(address, server.server_address[1], config.browser)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        log.info("viewer: ended")
+    finally:
+        server.server_close()
+    return {"address": address}
+
+
+def server_of(
+    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None
+) -> tuple[ThreadingHTTPServer, Site]:
+    """The server of a run's page, listening, and what it serves."""
+    token = token_for(config.host, config.token)
+    shown = find_shown(config, run, scene, compare)
+    layers = list(LAYERS) if config.exact else []
+    page = page_of(config, shown, live={"layers": layers, "token": token})
+    made = page.folder(*page.build())
+    files = {"" if name == "index.html" else name: content for name, content in made.items()}
+    report = Path(run) / "report.html"
+    if report.is_file():
+        files["report.html"] = store.read_bytes(report)
+    answers = {}
+    if config.exact:
+        source = FrameSource([model for _, model in shown.fits], config.width_px, drawing_device(config.device, "view"))
+        answers["frame"] = lambda asked: (source.png(parse_record(FrameRequest, asked, "request")), "image/png")
+    site = Site(files, answers, token)
+    return open_server(site, config.host, config.port), site

@@ -1,0 +1,292 @@
+"""The viewer page: what is packed, what a browser draws of it, and who may ask the server behind it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import CHROMIUM, NO_BROWSER, Browser
+from toy_fitted import STREET, toy_fitted, write_toy_run
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.core.trajectory import at_shift
+from mudg.models.scene.model import SceneModel
+from mudg.report.viewer import page as viewer_page
+from mudg.report.viewer.packed import BLOCK, blob_of, morton_codes, pack_scene, smallest_three
+from mudg.stages.config.view import PageConfig, ViewConfig
+from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.viewing import view
+from mudg.stages.viewing.server import token_for
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
+
+
+# what is packed ------------------------------------------------------------------------------------------------------
+
+
+def rotations(codes: np.ndarray) -> np.ndarray:
+    """Unit quaternions of ``smallest_three``, as the page unpacks them."""
+    small = np.stack([(codes >> shift & 1023).astype(float) - 512 for shift in (0, 10, 20)], 1) / (511 * np.sqrt(2))
+    absent = codes >> 30
+    whole = np.empty((len(codes), 4))
+    for index in range(4):
+        here = absent == index
+        whole[here] = np.insert(small[here], index, np.sqrt(np.maximum(0, 1 - np.square(small[here]).sum(1))), axis=1)
+    return whole
+
+
+def test_rotations_lose_less_than_a_quarter_of_a_degree() -> None:
+    quats = np.random.default_rng(0).normal(size=(2000, 4))
+    quats[0] = (0, 0, 0, -3)
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    apart = 2 * np.arccos(np.clip(np.abs((rotations(smallest_three(quats)) * unit).sum(1)), 0, 1))
+    assert np.degrees(apart).max() < 0.25
+
+
+def test_places_and_sizes_are_kept_within_their_steps() -> None:
+    model = toy_fitted(degree=3)
+    packed = pack_scene(model, 0.0)
+    s = packed.sections
+    opacity = torch.sigmoid(model.table["logits"].detach()).numpy()
+    assert packed.kept == len(s["certainty"]) == (opacity >= 1 / 255).sum()
+    levels = (s["position"][:3].astype(np.int64) | s["position"][3:].astype(np.int64) << 8).T
+    starts = np.repeat(s["block"], s["block_of"][:, 1], axis=0)
+    means = starts[:, :3] + levels * starts[:, 3:6]
+    sizes = starts[:, 6:9] + s["scale"].T * starts[:, 9:]
+    node = np.repeat(s["block_of"][:, 0], s["block_of"][:, 1])
+    true = model.table["means"].detach().numpy()
+    for row in range(0, packed.kept, 37):
+        own = np.flatnonzero((model.table.labels["node"].numpy() == node[row]) & (opacity >= 1 / 255))
+        nearest = own[np.abs(true[own] - means[row]).max(1).argmin()]
+        assert np.abs(true[nearest] - means[row]).max() < 1e-3
+        assert np.abs(model.table["log_scales"][nearest].detach().numpy() - sizes[row]).max() < 0.02
+    assert s["block_of"][:, 1].max() <= BLOCK
+    assert s["harmonics"].shape == (45, packed.kept)
+
+
+def test_a_budget_keeps_what_the_path_sees_largest() -> None:
+    model = toy_fitted(degree=0)
+    packed = pack_scene(model, 0.0, np.array([[0.0, 0, 1.2]]), most=200)
+    assert (packed.kept, packed.given) == (200, len(model.table))
+
+
+def test_neighbours_on_the_curve_are_neighbours_in_space() -> None:
+    places = np.random.default_rng(1).uniform(0, 1, (500, 3))
+    order = np.argsort(morton_codes(places, np.zeros(500, np.int64)))
+    steps = np.linalg.norm(np.diff(places[order], axis=0), axis=1).mean()
+    assert steps < 0.4 * np.linalg.norm(np.diff(places, axis=0), axis=1).mean()
+
+
+def test_sections_begin_at_multiples_of_four() -> None:
+    blob, directory = blob_of({"a": np.arange(3, dtype=np.uint8), "b": np.arange(2, dtype=np.float32)})
+    assert directory == {"a": [0, "u1", 3], "b": [4, "f4", 2]}
+    assert np.frombuffer(blob, np.float32, 2, 4).tolist() == [0, 1]
+
+
+def test_json_in_a_page_cannot_end_its_element() -> None:
+    text = viewer_page.script_json({"name": "</script><script>alert(1)</script><!--"})
+    assert "<" not in text and ">" not in text
+    assert json.loads(text)["name"].startswith("</script>")
+
+
+# the page ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, SceneModel]:
+    """Scene, fit and page folders of the toy."""
+    root = tmp_path_factory.mktemp("viewer")
+    scene, fit, _, model = write_toy_run(root)
+    made = view.run_page(PageConfig(), fit, root / "page.html", scene=scene, compare=fit)
+    assert made["bytes"] == (root / "page.html").stat().st_size
+    return root, fit, model
+
+
+def test_the_page_names_no_place_of_this_machine(toy: tuple[Path, Path, SceneModel]) -> None:
+    text = (toy[0] / "page.html").read_text(encoding="utf-8")
+    assert str(toy[0]) not in text
+    assert "http://" not in text and "https://" not in text
+    assert "<script>alert" not in text
+
+
+def test_a_page_is_not_replaced_without_being_asked(toy: tuple[Path, Path, SceneModel]) -> None:
+    with pytest.raises(UsageError, match="exists"):
+        view.run_page(PageConfig(), toy[1], toy[0] / "page.html", scene=toy[0] / "scene")
+    with pytest.raises(UsageError, match="log"):
+        view.run_page(PageConfig(), toy[1], toy[0] / "other.html")
+
+
+def test_a_large_page_becomes_a_folder(
+    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
+    made = view.run_page(PageConfig(images=0), toy[1], tmp_path / "page.html", scene=toy[0] / "scene")
+    assert made["page"] == tmp_path / "page" / "index.html"
+    assert (tmp_path / "page" / "scene-0.bin").stat().st_size > 1000
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(a - b).mean()))
+
+
+@pytest.fixture(scope="module")
+def opened(toy: tuple[Path, Path, SceneModel], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    one = Browser(tmp_path_factory.mktemp("profile"), size=(360, 300))
+    try:
+        one.open(f"file://{toy[0] / 'page.html'}#m=recorded&c=front&t=0.4")
+        yield one
+    finally:
+        one.close()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[Path, Path, SceneModel]) -> None:
+    from mudg.data.scene import read_scene
+
+    scene, model = read_scene(toy[0] / "scene"), toy[2]
+    for time_s, shift_m in ((0.0, 0.0), (0.4, 0.0), (0.4, 2.0), (0.6, -2.0), (0.8, 0.5)):
+        wanted = next(v for v in at_shift(scene, "front", shift_m).views if abs(v.time_s - time_s) < 1e-6)
+        true = render_view(model, wanted, RasterConfig(near_m=NEAR_M))
+        seen = opened.measure(["color", "depth", "class", "confidence"], camera="front", t=time_s, shift=shift_m)
+        assert psnr(seen["color"][..., :3] / 255.0, true.rgb.permute(1, 2, 0).numpy()) >= 38
+        depth = np.where(
+            seen["depth"][..., 3] >= 0.5, seen["depth"][..., 0] / np.maximum(seen["depth"][..., 3], 1e-6), np.nan
+        )
+        both = np.isfinite(depth) & np.isfinite(true.depth[0].numpy())
+        assert np.median(np.abs(depth[both] / true.depth[0].numpy()[both] - 1)) <= 0.01
+        assert (seen["class"] == true.semantics.numpy()).mean() >= 0.97
+        assert seen["confidence"][..., 0].max() <= 1.001
+    assert opened.errors == []
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_page_loads_nothing_and_says_no_foreign_script(opened: Browser) -> None:
+    assert all(address.startswith(("file://", "blob:", "data:")) for address in opened.requests)
+    assert (
+        opened.run("[...document.querySelectorAll('#objects .name')].map((e) => e.textContent).join()").count(
+            "<script>"
+        )
+        == 1
+    )
+    assert opened.run("document.querySelectorAll('#objects script').length") == 0
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_link_shows_the_same(opened: Browser) -> None:
+    opened.run("location.hash = '#m=recorded&c=front&t=0.6&l=depth&s=1.5&v=difference-scene&o=boxes'; 1")
+    opened.wait("window.mudg.state.layer === 'depth' && window.mudg.sharp")
+    state = opened.run("JSON.stringify(window.mudg.state)")
+    assert {"t": 0.6, "shift": 1.5, "compare": "difference-scene", "boxes": True}.items() <= json.loads(state).items()
+    assert opened.run("location.hash").count("l=depth") == 1
+    # the same fit twice differs nowhere
+    middle = (
+        "const c = document.createElement('canvas'); c.width = c.height = 64; const x = c.getContext('2d');"
+        "x.drawImage(document.getElementById('canvas'), 0, 0, 64, 64); const p = x.getImageData(24, 24, 16, 16).data;"
+    )
+    shown = opened.run(f"(() => {{ {middle} return Math.max(...p.filter((_, i) => i % 4 < 3)); }})()")
+    assert shown == 0
+
+
+@pytest.mark.slow
+@needs_browser
+def test_hidden_objects_are_gone(opened: Browser, toy: tuple[Path, Path, SceneModel]) -> None:
+    with_car = opened.measure(["class"], camera="front", t=0.4)["class"]
+    without = opened.measure(["class"], camera="front", t=0.4, hidden=["car-1"])["class"]
+    assert (with_car == ID["car"]).sum() > 20
+    assert (without == ID["car"]).sum() == 0
+
+
+# the server ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def served(toy: tuple[Path, Path, SceneModel]) -> Iterator[tuple[int, str]]:
+    config = ViewConfig(images=0, browser=False, device="cpu")
+    server, site = view.server_of(config, toy[1], None, toy[0] / "scene")
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server.server_address[1], site.token
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def ask(port: int, method: str, path: str, body: object = None, **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(
+        method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named}
+    )
+    try:
+        with connection.getresponse() as answer:
+            return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> None:
+    port, token = served
+    assert ask(port, "GET", f"/?token={token}")[0] == 200
+    assert ask(port, "GET", "/")[0] == 403
+    assert ask(port, "GET", "/?token=wrong")[0] == 403
+    assert ask(port, "GET", f"/?token={token}", Host="evil.example")[0] == 403
+    assert ask(port, "GET", "/scene-0.bin", Cookie=f"mudg_token={token}")[0] == 200
+    for path in ("/../fit/model.json", "/%2e%2e/model.json", "//etc/passwd", "/model.json"):
+        assert ask(port, "GET", path, Cookie=f"mudg_token={token}")[0] == 404
+    own = f"http://127.0.0.1:{port}"
+    assert ask(port, "POST", "/frame", {}, X_Mudg_Token=token)[0] == 403
+    assert ask(port, "POST", "/frame", {}, X_Mudg_Token=token, Origin="https://evil.example")[0] == 403
+    status, text = ask(port, "POST", "/frame", {"layer": "color"}, X_Mudg_Token=token, Origin=own)
+    assert status == 400 and b"request" in text
+
+
+def test_the_server_draws_exact_frames(served: tuple[int, str], toy: tuple[Path, Path, SceneModel]) -> None:
+    import io
+
+    from PIL import Image
+
+    port, token = served
+    wanted = STREET.view(0.4, 160, 96)
+    pose, camera = wanted.world_from_cam, wanted.camera
+    body = {
+        "scene": 0, "layer": "color", "time_s": 0.4, "hidden": [], "camera": "front", "width": 160, "height": 96, "fx": camera.fx,
+        "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(),
+    }  # fmt: skip
+    here = {"Origin": f"http://localhost:{port}", "Host": f"localhost:{port}"}
+    status, content = ask(port, "POST", "/frame", body, X_Mudg_Token=token, **here)
+    assert status == 200
+    true = render_view(toy[2], wanted, RasterConfig(near_m=NEAR_M)).rgb.permute(1, 2, 0).numpy()
+    assert np.abs(np.asarray(Image.open(io.BytesIO(content))) / 255.0 - true).max() < 0.003
+
+
+def test_other_machines_need_a_token() -> None:
+    with pytest.raises(UsageError, match="token"):
+        token_for("0.0.0.0", "")
+    with pytest.raises(UsageError, match="short"):
+        token_for("0.0.0.0", "abc")
+    assert token_for("192.168.1.2", "long enough a secret") == "long enough a secret"
+    assert len(token_for("127.0.0.1", "")) >= 16
+
+
+def test_fits_of_different_logs_are_not_compared(toy: tuple[Path, Path, SceneModel], tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from mudg.stages.fitting.storage import save_model
+
+    save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
+    with pytest.raises(InputError, match="another"):
+        view.find_shown(PageConfig(), toy[1], toy[0] / "scene", tmp_path / "fit")
