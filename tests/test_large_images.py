@@ -9,6 +9,7 @@ import torch
 
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Trajectory, View
+from mudg.core import flicker
 from mudg.core.metrics import Pair
 from mudg.models import featnets
 from mudg.models.featnets import CodecFeatures, PerceptualDistance
@@ -66,3 +67,21 @@ def test_a_view_that_cannot_fit_is_refused_before_the_work(monkeypatch: pytest.M
     with pytest.raises(ResourceError, match="1000000 x 562500 pixels needs more memory") as refused:
         render._require_memory([path])
     assert "TiB" in refused.value.expected and refused.value.got == "64.0 GiB free" and "--width-px" in refused.value.remedy
+
+
+def test_motion_found_in_bands_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = torch.Generator().manual_seed(2)
+    depth = torch.rand(2, 1, 37, 23, generator=noise) * 20 + 5
+    ids = torch.randint(0, 19, (2, 37, 23), generator=noise)
+    instance = torch.randint(0, 3, (37, 23), generator=noise)
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 2, 3] = 0.4
+    lens = torch.tensor([20.0, 20.0, 11.5, 18.5], dtype=torch.float64)
+    frames = [flicker.TrueFrame(depth[n], ids[n], poses[n], lens) for n in (0, 1)]
+    whole = flicker.pixel_motion(*frames, {1: poses[1]}, instance)
+    monkeypatch.setattr(flicker, "WHOLE_PIXELS", 0)
+    monkeypatch.setattr(flicker, "BAND_PIXELS", 23 * 8)
+    bands = flicker.pixel_motion(*frames, {1: poses[1]}, instance)
+    assert bands.there.shape == whole.there.shape and whole.same.any()
+    torch.testing.assert_close(bands.there, whole.there, rtol=1e-6, atol=1e-6)
+    assert torch.equal(bands.same, whole.same)

@@ -14,6 +14,7 @@ from toy_world import CAR_SIZE, car_pose, fused_cloud, write_scene
 from mudg.base import geometry, store
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.cloudfile import write_fused
 from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_scene
@@ -99,7 +100,7 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     config = RenderConfig(shifts_m=(0.0,), remove_tracks=("car",), video=False)
     folder = render.run(config, world["scene"], world["model"], tmp_path / "out")
     seen = read_observations(folder / "front_recorded")[1]
-    with_car = fit.render_view(fit.load_model(world["model"]), seen.view, render.RasterConfig())
+    with_car = fit.render_view(fit.load_model(world["model"]), seen.view, RasterConfig())
     uv, _ = geometry.project(seen.view, (car_pose(seen.view.time_s)[:3, 3] - [0, 0, CAR_SIZE[2] / 4])[None])
     row, column = int(uv[0, 1]), int(uv[0, 0])
     assert with_car.semantics[row, column] == ID["car"]

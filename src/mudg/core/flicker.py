@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -12,6 +13,9 @@ from torch import Tensor
 from mudg.base import geometry, palette
 from mudg.base.types import View
 
+WHOLE_PIXELS: Final = 2_500_000
+"""Images of up to this many pixels are carried in one piece, larger ones in bands of rows."""
+BAND_PIXELS: Final = 600_000
 MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"))
 
 
@@ -74,7 +78,23 @@ def pixel_motion(
             frame; their pixels are carried with them and count as static ones do.
     """
     height, width = frame.ids.shape
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    count = height if height * width <= WHOLE_PIXELS else max(1, BAND_PIXELS // width)
+    found = [
+        _motion_of_rows(frame, following, moved, instance, range(first, min(height, first + count))) for first in range(0, height, count)
+    ]
+    if len(found) == 1:
+        return found[0]
+    return PixelMotion(torch.cat([part.there for part in found], 1), torch.cat([part.same for part in found]))
+
+
+def _motion_of_rows(
+    whole: TrueFrame, following: TrueFrame, moved: Mapping[int, Tensor] | None, instance: Tensor | None, chosen: range
+) -> PixelMotion:
+    """``pixel_motion`` of some rows of the frame."""
+    (height, width), rows_of = whole.ids.shape, slice(chosen.start, chosen.stop)
+    frame = replace(whole, depth=whole.depth[:, rows_of], ids=whole.ids[rows_of])
+    instance = None if instance is None else instance[rows_of]
+    rows, columns = torch.meshgrid(torch.arange(chosen.start, chosen.stop) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
     z = frame.depth[0]
     ray_x, ray_y = geometry.pinhole_ray(frame.intrinsics.float(), columns, rows)

@@ -236,7 +236,9 @@ def _score(
             )
         if reference.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / trajectory.name, trajectory.name, BASELINE))
-        for number, made in enumerate(_in_order(measure, trajectory, threads)):
+        views = _in_order(measure, trajectory, threads)
+        for number in range(len(trajectory.views)):  # not over `views`: the last one would stay in memory while the next is made
+            made = next(views)
             if fills is not None:
                 fills.add(made.seen[BASELINE])
             if number in counted:
@@ -252,6 +254,7 @@ def _score(
             for name, values in made.measured.items():
                 for metric, value in values.items():
                     sums[name][metric].add(value)
+            del made
             advance()
     anchors = _values(sums.pop(TRUTH), truth_has)
     return [
