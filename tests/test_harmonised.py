@@ -106,6 +106,12 @@ def test_photographs_count_where_an_object_is_on_its_recorded_place() -> None:
     assert not moved.usable[16, 10 + 24] and not moved.usable[16, 17]
 
 
+def test_a_box_beside_the_camera_does_not_cover_the_image() -> None:
+    beside = (geometry.yaw_matrix(0.0, (0.0, -2.0, 0.0)), np.array([4.0, 1.8, 1.5]))
+    mask = boxes_mask(view_at(), [beside])
+    assert 0 < mask.mean() < 0.3 and not mask[:, :24].any()
+
+
 def test_points_that_a_box_left_behind_are_cleared() -> None:
     cloud = FusedCloud(wall(6.2, stripes, (-3, 3), (-0.4, 0.4)), {})
     kept = cleared_cloud(cloud, drive("- remove: {ids: [box]}")).static.xyz

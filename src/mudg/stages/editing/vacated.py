@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 from mudg.base import geometry, log
 from mudg.base.errors import InputError
@@ -27,7 +28,6 @@ from mudg.stages.editing.apply import edited_cloud, edited_scene
 from mudg.stages.editing.carried import carry_out, opener
 from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.weathered import conditions_of
-from mudg.stages.fitting.objects import outline_mask
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Pose world_from_box f64[4, 4] and size f64[3] in metres."""
@@ -192,7 +192,11 @@ def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArra
 
 def _outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     covered = np.zeros((view.camera.height, view.camera.width), bool)
-    for pose, (length, width, height) in boxes:
-        outline = outline_mask(view, pose, (length, width, height))
-        covered = covered if outline is None else covered | outline
+    for pose, size in boxes:
+        hull = geometry.box_hull(view, pose, size)  # of what lies ahead: a box beside the camera does not cover the whole image
+        if hull is not None:
+            canvas = Image.new("1", (view.camera.width, view.camera.height))
+            outline = [(float(x), float(y)) for x, y in hull.points[hull.vertices] - 0.5]
+            ImageDraw.Draw(canvas).polygon(outline, fill=1, outline=1)
+            covered |= np.array(canvas, bool)
     return covered
