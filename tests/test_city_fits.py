@@ -1,6 +1,7 @@
 """Short fits of training cities: the scene that is fitted, and the whole way from a city to a model that takes renders."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,13 +85,24 @@ def test_without_patches_a_finisher_keeps_its_weights(tmp_path):
     assert all(p.requires_grad for p in model.net.parameters())
 
 
+def test_steps_of_fits_are_drawn_from_their_range(tmp_path):
+    rules = replace(RULES, fit_steps=(400, 1000))
+    steps = [city_fits.steps_of(rules, city) for city in range(60)]
+    assert 400 <= min(steps) < 450 and 950 < max(steps) < 1000
+    assert city_fits.steps_of(rules, from_city.HELD_OUT) == 700
+    assert city_fits.steps_of(replace(rules, fit_steps=(50, 50)), 3) == 50
+    assert [city_fits.steps_of(RULES, city) for city in range(3)] == [117, 116, 113]  # as before there was a setting
+    config = with_settings(tiny(tmp_path), fit_steps=(400, 1000), log_frames=24, side_cameras=0.7)
+    made = learn_clips.clip_rules(config)
+    assert (made.fit_steps, made.log_frames, made.side_cameras) == ((400, 1000), 24, 0.7)
+
+
 @pytest.mark.slow
-def test_a_city_is_fitted_and_learnt_from(tmp_path, monkeypatch):
+def test_a_city_is_fitted_and_learnt_from(tmp_path):
     """From the generator over a short fit to a trained model with finisher; the renders resemble what they show."""
-    monkeypatch.setattr(city_fits, "FEWEST_STEPS", 60)
-    monkeypatch.setattr(city_fits, "MOST_STEPS", 100)
+    rules = replace(RULES, fit_steps=(60, 100))
     for city in (0, from_city.HELD_OUT):
-        assert city_fits.write_fitted_city(RULES, city, tmp_path / "clips") == (2 if city == 0 else len(from_city.shifts_of(RULES, city)))
+        assert city_fits.write_fitted_city(rules, city, tmp_path / "clips") == (2 if city == 0 else len(from_city.shifts_of(RULES, city)))
     shifted = clip_shards.read_clip(tmp_path / "clips", 0, 0, [0, 1])
     shown = shifted.condition.renders
     assert shifted.fine is not None and shifted.fine.clip.condition.renders is not None

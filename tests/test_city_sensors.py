@@ -303,6 +303,39 @@ def test_cities_for_scoring_and_plain_cities_know_nothing_of_it() -> None:
     assert config.skies == "plain"
 
 
+def test_mixed_cities_are_varied_and_plain_by_turns_and_have_all_sizes_of_both() -> None:
+    mixed, rules = from_city.CityClipRules(realism="mixed"), from_city.CityClipRules(realism="varied")
+    kinds = [from_city.is_varied(mixed, city) for city in range(20)]
+    assert kinds == [True] * 5 + [False] * 5 + [True] * 5 + [False] * 5
+    assert not from_city.is_varied(mixed, from_city.HELD_OUT)
+    for city in range(10):
+        assert from_city.size_of(mixed, city) == from_city.size_of(rules, city)
+        config, fine = from_city.city_config(mixed, city), from_city.fine_of(mixed, city)
+        assert (config.width, config.height) == tuple(fine * side for side in from_city.size_of(mixed, city))
+    assert from_city.city_config(mixed, 3) == from_city.city_config(rules, 3)
+    assert from_city.city_config(mixed, 8).skies == "plain" and from_city.sensors_of(mixed, 8) == SensorFaults()
+
+
+def test_the_share_of_cities_with_three_cameras_changes_nothing_else() -> None:
+    for realism in ("varied", "plain"):
+        rules = from_city.CityClipRules(realism=realism)
+        drawn = [from_city.city_config(rules, city) for city in range(40)]
+        for share, cameras in ((0.0, 1), (1.0, 3)):
+            others = [from_city.city_config(replace(rules, side_cameras=share), city) for city in range(40)]
+            assert {len(config.cameras) for config in others} == {cameras}
+            assert [replace(config, cameras=("front",)) for config in others] == [replace(config, cameras=("front",)) for config in drawn]
+        assert 5 < sum(len(config.cameras) == 3 for config in drawn) < 25
+
+
+def test_clips_of_longer_logs_begin_anywhere_but_at_the_ends() -> None:
+    rules = from_city.CityClipRules(log_frames=24)
+    starts = {from_city.start_of(rules, city, number) for city in range(20) for number in range(6)}
+    assert starts == set(range(2, 24 - 2 - 8 + 1))
+    for short in (from_city.CityClipRules(), from_city.CityClipRules(window=16)):
+        assert {from_city.start_of(short, city, number) for city in range(9) for number in range(6)} == {2}
+        assert short.frames == max(12, 2 + short.window)
+
+
 @needs_native
 def test_varied_clips_are_reproducible() -> None:
     rules = from_city.CityClipRules(width=48, height=32, window=2, clips=2, realism="varied", fine=1)

@@ -82,8 +82,8 @@ def test_training_continues_from_a_model(clips, tmp_path):
 
 
 def test_class_weights_lift_rare_classes(clips):
-    assert torch.equal(learn_clips.class_weights(clips, 2, 0.0), torch.ones(19))
-    weight = learn_clips.class_weights(clips, 2, 0.5)
+    assert torch.equal(learn_clips.class_weights(clips, range(2), 0.0), torch.ones(19))
+    weight = learn_clips.class_weights(clips, range(2), 0.5)
     assert float(weight[13]) > float(weight[0])
 
 
@@ -91,7 +91,7 @@ def test_fewer_cities_than_training_begins_with_are_not_waited_for(clips, monkey
     config = with_settings(tiny(clips), first_cities=40)
     assert config.data.cities < config.data.first_cities
     monkeypatch.setattr(learn, "class_weights", lambda folder, cities, balance: cities)
-    assert learn._class_weights(config, clips) == config.data.cities
+    assert learn._class_weights(config, clips) == range(config.data.cities)
 
 
 def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
@@ -117,14 +117,23 @@ def test_batches_depend_on_step_only(clips):
     assert not torch.equal(first[0].rgb, other[0].rgb)
 
 
+def test_cities_that_are_skipped_are_never_drawn(clips):
+    config = with_settings(tiny(clips, cities=2, first_cities=2), skip_cities=1, augment=False)
+    allowed = [clip_shards.read_clip(clips, city, k, range(4)).rgb for city in (1, 2) for k in range(2)]
+    drawn = [clip.rgb for step in range(8) for clip in learn.draw_clips(config, clips, step, 2, 4, "batch")]
+    assert all(any(torch.equal(one, rgb) for rgb in allowed) for one in drawn)
+    assert all(any(torch.equal(one, rgb) for one in drawn) for rgb in allowed)
+
+
 def test_schedules(clips):
     config = tiny(clips, steps=1000, warmup_steps=100, decay_share=0.5, lr=1e-3, cities=3, first_cities=1)
     assert learn.learning_rate(config, 0) == pytest.approx(1e-5)
     assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
     assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
     assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
-    assert learn_clips.cities_in_use(config, 0) == 1
-    assert learn_clips.cities_in_use(config, 600) == 3
+    assert learn_clips.cities_in_use(config, 0) == range(1)
+    assert learn_clips.cities_in_use(config, 600) == range(3)
+    assert learn_clips.cities_in_use(with_settings(config, skip_cities=2), 600) == range(2, 5)
     assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
 
 

@@ -182,11 +182,11 @@ def test_a_step_has_clips_of_one_size() -> None:
     config = LearnConfig(data=LearnData(realism="varied"))
     sizes = learn_clips.sizes_of_cities(config)
     assert len(set(sizes)) == 5
-    for count in (3, 7, 40):
-        for first in range(count):
-            for city in range(count):
-                chosen = learn_clips._of_same_size(city, first, sizes, count)
-                assert 0 <= chosen < count
+    for cities in (range(3), range(7), range(40), range(5, 12), range(8, 21)):
+        for first in cities:
+            for city in cities:
+                chosen = learn_clips._of_same_size(city, first, sizes, cities)
+                assert chosen in cities
                 assert sizes[chosen % 5] == sizes[first % 5]
     assert learn_clips.sizes_of_cities(LearnConfig()) == [(192, 128)]
     assert len(learn_clips.sizes_of_cities(learn_clips.of_one_size(config))) == 1

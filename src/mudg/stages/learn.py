@@ -155,7 +155,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
-        hold_finisher(model, fresh, learn_clips.have_patches(folder))
+        hold_finisher(model, fresh, learn_clips.have_patches(folder, config.data.skip_cities))
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 
     def finish() -> None:
@@ -176,7 +176,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
 
 
 def _class_weights(config: LearnConfig, folder: Path) -> Tensor:
-    return class_weights(folder, min(config.data.first_cities, config.data.cities, 20), config.loss.class_balance)
+    return class_weights(folder, learn_clips.cities_in_use(config, 0)[:20], config.loss.class_balance)
 
 
 # network --------------------------------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
-Realism = Literal["plain", "varied"]
+Realism = Literal["plain", "varied", "mixed"]
 
 FRAMES = 12
 SIZES = len(varied.ASPECTS)
@@ -75,7 +75,14 @@ class CityClipRules:
     near_points: bool = False
     """FreeVS' condition (`near_points.py`): points of a few frames alone."""
     realism: Realism = "plain"
-    """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`."""
+    """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`. mixed: so are
+    half of them; the others are plain, of these sizes."""
+    log_frames: int = FRAMES
+    """Length of the logs at least. In longer ones than `FRAMES` each clip begins at a frame of its own."""
+    side_cameras: float | None = None
+    """Share of the training cities with two cameras beside the front one (None: 0.4 of plain cities, 0.35 of varied ones)."""
+    fit_steps: tuple[int, int] = (100, 300)
+    """Fewest and most steps of the fit to a training city; cities for scoring have the middle of them."""
     fitted: bool = False
     """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch at a higher
     resolution; recorded images are 2 to 4 times larger than the clips."""
@@ -85,17 +92,18 @@ class CityClipRules:
     @property
     def frames(self) -> int:
         """Length of the log."""
-        return max(FRAMES, FIRST + self.window)
+        return max(FRAMES, self.log_frames, FIRST + self.window)
 
 
 def is_varied(rules: CityClipRules, city: int) -> bool:
-    """Whether a city is drawn from the varied distribution; cities for scoring never are."""
-    return rules.realism == "varied" and city < HELD_OUT
+    """Whether a city is drawn from the varied distribution; cities for scoring never are. Of mixed ones, `SIZES` neighbours are (one of
+    each size) and the next are not."""
+    return city < HELD_OUT and (rules.realism == "varied" or (rules.realism == "mixed" and city // SIZES % 2 == 0))
 
 
 def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
-    """Width and height of a city's clips. Varied cities differ in aspect, except for the published system's fixed size."""
-    if is_varied(rules, city) and not rules.published:
+    """Width and height of a city's clips. Varied and mixed cities differ in aspect, except for the published system's fixed size."""
+    if rules.realism != "plain" and city < HELD_OUT and not rules.published:
         return varied.sized(rules.width, rules.height, city)
     return rules.width, rules.height
 
@@ -115,16 +123,15 @@ def sensors_of(rules: CityClipRules, city: int) -> SensorFaults:
 def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
     seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
-    fine = fine_of(rules, city)
-    plain = CityConfig(seed=seed, n_frames=FRAMES, width=rules.width * fine, height=rules.height * fine)
+    fine, (width, height) = fine_of(rules, city), size_of(rules, city)
+    plain = CityConfig(seed=seed, n_frames=FRAMES, width=width * fine, height=height * fine)
     if city >= HELD_OUT:
         return plain
     if is_varied(rules, city):
-        width, height = size_of(rules, city)
-        plain = replace(plain, width=width * fine, height=height * fine)
-        return varied.draw_city(rules.seed, city, plain, rules.textures)
+        share = varied.SIDE_CAMERAS if rules.side_cameras is None else rules.side_cameras
+        return varied.draw_city(rules.seed, city, plain, rules.textures, share)
     rng = seeds.numpy_rng(rules.seed, city, "city configuration")
-    side_cameras = rng.random() < 0.4
+    side_cameras = rng.random() < (0.4 if rules.side_cameras is None else rules.side_cameras)
     return replace(
         plain,
         rate_hz=float(rng.choice([10.0, 10.0, 6.0])),
@@ -152,6 +159,12 @@ def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
     if is_varied(rules, city):  # less where there is less room
         shifted = [shift * city_config(rules, city).shift_margin_m / varied.MARGIN_M for shift in shifted]
     return tuple([*shifted, 0.0][-rules.clips :]) if rules.clips > 1 else (shifted[0],)
+
+
+def start_of(rules: CityClipRules, city: int, number: int) -> int:
+    """First frame of clip `number` of a city: where the log reaches `FIRST` frames beyond the clip at both ends, if it is so long."""
+    last = rules.frames - FIRST - rules.window
+    return FIRST if last <= FIRST else int(seeds.numpy_rng(rules.seed, city * 64 + number, "start").integers(FIRST, last + 1))
 
 
 def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
@@ -208,7 +221,7 @@ def make_clips(
     log = log or make_log(rules, city, rules.frames)
     rng = seeds.numpy_rng(rules.seed, city, "clips")
     size, scale = size_of(rules, city), fine_of(rules, city)
-    recorded_views = log.world.frame_views("front")[FIRST : FIRST + rules.window]
+    front_views = log.world.frame_views("front")
     conditions = ConditionRules(*size, size[0] * scale, size[1] * scale, published=rules.published)
     tracks = log.tracks()
     clips = []
@@ -216,7 +229,8 @@ def make_clips(
     known = _known(rules, city, log, rng)
     near = near_sweeps(log)
     for number, shift_m in enumerate(shifts_of(rules, city)):
-        views = [shifted_view(log.world, view, shift_m) for view in recorded_views]
+        start = start_of(rules, city, number)
+        views = [shifted_view(log.world, view, shift_m) for view in front_views[start : start + rules.window]]
         given, cache = known, sources
         if shift_m == 0.0 and not rules.fitted:
             given, cache = _split_moments(log.recorded, int(rng.integers(2, 5)), rng)[0], {}

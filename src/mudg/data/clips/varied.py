@@ -38,6 +38,9 @@ LIDARS: Final = (
 LIDAR_SHARES: Final = (0.3, 0.18, 0.12, 0.12, 0.08, 0.06, 0.06, 0.08)
 
 
+SIDE_CAMERAS: Final = 0.35
+"""Share of the cities with two cameras beside the front one."""
+
 MARGIN_M: Final = 4.2
 """Largest lateral shift of a clip, metres. Nearly half of the cities have less, so that lorries may stand right beside the camera; their
 clips are shifted by as much less."""
@@ -56,21 +59,24 @@ def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, 
     return columns * multiple, rows * multiple
 
 
-def draw_city(seed: int, city: int, plain: CityConfig, textures: str = "") -> CityConfig:
+def draw_city(
+    seed: int, city: int, plain: CityConfig, textures: str = "", side_cameras: float = SIDE_CAMERAS
+) -> CityConfig:
     """Configuration of a training city.
 
     Args:
         seed, city: fix everything.
         plain: seed, length and image size; the rest is drawn here.
         textures: folder of photographs for `CityConfig.textures`; four fifths of the cities use it.
+        side_cameras: share of the cities with two cameras beside the front one.
     """
     rng = seeds.numpy_rng(seed, city, "varied city")
     beams, lower, upper = LIDARS[int(rng.choice(len(LIDARS), p=LIDAR_SHARES))]
-    side_cameras = rng.random() < 0.35
+    beside = rng.random() < side_cameras
     return replace(
         plain,
         rate_hz=float(rng.choice([10.0, 10.0, 10.0, 6.0, 12.0])),
-        cameras=("front", "front_left", "front_right") if side_cameras else ("front",),
+        cameras=("front", "front_left", "front_right") if beside else ("front",),
         hfov_deg=float(rng.choice([rng.uniform(42, 55), rng.uniform(50, 85), rng.uniform(80, 108)], p=[0.2, 0.5, 0.3])),
         rig_variation=1.0,
         lidar_beams=beams,

@@ -20,9 +20,6 @@ from mudg.stages import fit
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.short import short_fit
 
-FEWEST_STEPS, MOST_STEPS = 100, 300
-"""Steps of a training city's fit; those for scoring have the middle of them. How good the renders are varies from log to log."""
-
 
 def write_fitted_city(rules: CityClipRules, city: int, folder: Path) -> int:
     """Make one city's clips with renders of a fit and write its shard; returns the number of clips. For a process of its own."""
@@ -31,8 +28,7 @@ def write_fitted_city(rules: CityClipRules, city: int, folder: Path) -> int:
 
 def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
     """Fit a scene to the images that the clips of a city may know; returns what it shows at a view."""
-    rng = seeds.numpy_rng(rules.seed, city, "fit")
-    steps = int(rng.integers(FEWEST_STEPS, MOST_STEPS)) if city < from_city.HELD_OUT else (FEWEST_STEPS + MOST_STEPS) // 2
+    steps = steps_of(rules, city)
     width = from_city.size_of(rules, city)[0]
     images = from_city.given_images(rules, city, log)
     config = short_fit(steps, width, images[0].view.camera.width, seed=city)
@@ -46,6 +42,14 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
         return render_planes(model, view)
 
     return render_at
+
+
+def steps_of(rules: CityClipRules, city: int) -> int:
+    """Steps of a city's fit, drawn from `rules.fit_steps`, because renders of logs are of different quality, too."""
+    fewest, most = rules.fit_steps
+    if city >= from_city.HELD_OUT or fewest == most:
+        return (fewest + most) // 2
+    return int(seeds.numpy_rng(rules.seed, city, "fit").integers(fewest, most))
 
 
 def placed_sweeps(log: CityLog) -> Iterator[PlacedSweep]:

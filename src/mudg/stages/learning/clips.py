@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,15 +31,16 @@ def held_out_cities(config: LearnConfig) -> list[int]:
     return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
 
 
-def cities_in_use(config: LearnConfig, step: int) -> int:
-    """How many cities training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`.
+def cities_in_use(config: LearnConfig, step: int) -> range:
+    """Cities that training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`, after those skipped.
 
     A function of the step alone, so that clips can still be in the making while training runs and the draw stays the
     same in every run.
     """
     data = config.data
     share = min(1.0, step / max(1.0, data.all_cities_at * config.steps))
-    return min(data.cities, data.first_cities + int((data.cities - data.first_cities) * share))
+    count = min(data.cities, data.first_cities + int((data.cities - data.first_cities) * share))
+    return range(data.skip_cities, data.skip_cities + count)
 
 
 # cities ---------------------------------------------------------------------------------------------------------------
@@ -51,6 +53,7 @@ def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.Cit
         data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone,
         realism=data.realism, textures=data.textures,
         fitted=data.renders and not points_alone, near_points=data.condition == "freevs",
+        log_frames=data.log_frames, side_cameras=data.side_cameras, fit_steps=data.fit_steps,
     )
 
 
@@ -64,7 +67,7 @@ class MakingClips:
 
     def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
         self._rules, self._folder = clip_rules(config, points_alone), folder
-        wanted = [*held_out_cities(config), *range(config.data.cities)]
+        wanted = [*held_out_cities(config), *(config.data.skip_cities + n for n in range(config.data.cities))]
         self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
         self._workers = config.compute.workers
         self._pool: concurrent.futures.ProcessPoolExecutor | None = None
@@ -160,7 +163,7 @@ def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) 
         log.warn("learn: no clip is held out; the scored clip was also trained on")
     data = replace(
         config.data, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
-        held_out=max(1, scored),
+        held_out=max(1, scored), skip_cities=0,
     )  # fmt: skip
     return replace(config, data=data, score=replace(config.score, watched=min(config.score.watched, max(1, scored))))
 
@@ -197,10 +200,10 @@ def sizes_of_cities(config: LearnConfig) -> list[tuple[int, int]]:
     return [from_city.size_of(rules, city) for city in range(from_city.SIZES)]
 
 
-def _of_same_size(city: int, first: int, sizes: list[tuple[int, int]], count: int) -> int:
-    """The city of the first one's size next to `city`, out of `count`."""
+def _of_same_size(city: int, first: int, sizes: list[tuple[int, int]], cities: range) -> int:
+    """The city of the first one's size next to `city`, out of `cities`."""
     near = city - city % len(sizes) + first % len(sizes)
-    return near if near < count else near - len(sizes) if near >= len(sizes) else first
+    return next((n for n in (near, near - len(sizes), near + len(sizes)) if n in cities), first)
 
 
 def draw_clips(
@@ -213,10 +216,10 @@ def draw_clips(
     """
     rng = seeds.numpy_rng(config.seed, step, purpose)
     picks: list[tuple[int, int, range]] = []
-    sizes = sizes_of_cities(config)
+    sizes, cities = sizes_of_cities(config), cities_in_use(config, step)
     for _ in range(count):
-        city = int(rng.integers(cities_in_use(config, step)))
-        city = city if not picks else _of_same_size(city, picks[0][0], sizes, cities_in_use(config, step))
+        city = cities[int(rng.integers(len(cities)))]
+        city = city if not picks else _of_same_size(city, picks[0][0], sizes, cities)
         await_shard(folder, city)
         number = int(rng.integers(clip_shards.clips_in(folder, city)))
         start = int(rng.integers(config.data.window - frames + 1))
@@ -237,19 +240,19 @@ def draw_clips(
     return clips
 
 
-def have_patches(folder: Path) -> bool:
-    """Whether the clips have patches at a higher resolution; seen in the first one."""
-    await_shard(folder, 0)
-    return clip_shards.read_clip(folder, 0, 0, range(1)).fine is not None
+def have_patches(folder: Path, city: int = 0) -> bool:
+    """Whether the clips have patches at a higher resolution; seen in the first one of a city."""
+    await_shard(folder, city)
+    return clip_shards.read_clip(folder, city, 0, range(1)).fine is not None
 
 
-def class_weights(folder: Path, cities: int, balance: float) -> Tensor:
-    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over the first cities.
+def class_weights(folder: Path, cities: Iterable[int], balance: float) -> Tensor:
+    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some cities.
 
     Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
     """
     counts = torch.zeros(256, dtype=torch.float64)
-    for city in range(cities):
+    for city in cities:
         await_shard(folder, city)
         ids = clip_shards.read_clip(folder, city, 0, range(1)).semantics
         counts += torch.bincount(ids.flatten(), minlength=256)
