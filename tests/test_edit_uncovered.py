@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 
 from mudg.base import geometry
@@ -10,18 +13,18 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
 from mudg.core.table import Table
-from mudg.models.scene.edited import linear_of
+from mudg.data.edits import parse_edits
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import CERTAINTY, SceneModel
 from mudg.models.scene.nodes import StaticNode
 from mudg.models.scene.uncovered import without_traces
 from mudg.stages.editing.apply import hidden_by
-from mudg.stages.editing.plan import Actor
+from mudg.stages.editing.plan import Actor, EditSources, EditWorld, plan_edits
 
 SIZE = (4.0, 2.0, 1.5)
 CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-LIT, SHADED = 0.6, 0.35
+LIT, SHADED = 0.55, 0.4
 
 
 def lead() -> tuple[Actor, list[View]]:
@@ -53,7 +56,7 @@ def grey_of(model: SceneModel) -> np.ndarray:
     return 0.5 + SH_C0 * model.table["sh_dc"].detach().numpy()[:, 0, 0].astype(np.float64)
 
 
-def test_hidden_ground_is_closed_and_the_shadow_is_as_bright_as_what_lies_around() -> None:
+def test_hidden_ground_is_closed() -> None:
     xy = np.stack(np.meshgrid(np.arange(2, 30, 0.3), np.arange(-7, 7, 0.3), indexing="ij"), -1).reshape(-1, 2)
     seen = (np.abs(xy[:, 1]) > 2.4) | (xy[:, 0] < 9)  # nobody saw the road ahead of the car
     floaters = np.array([[9.0, 0.2, 0.9], [8.2, -0.4, 0.6]])
@@ -69,11 +72,20 @@ def test_hidden_ground_is_closed_and_the_shadow_is_as_bright_as_what_lies_around
     inside = means[new, :2]
     assert inside[:, 0].min() > 7 and np.abs(inside[:, 1]).max() < 6
     assert ((inside[:, 0] > 13) & (np.abs(inside[:, 1]) < 0.5)).any()  # the middle of what was hidden
-    near = ~new & ~buildings & (np.abs(means[:, 1]) < 1.4) & (means[:, 0] > 6) & (means[:, 0] < 9)
-    assert np.allclose(linear_of(grey[near]), linear_of(np.array(LIT)), rtol=0.03)
     far = ~new & ~buildings & (np.abs(means[:, 1]) > 2.5)
     assert np.allclose(grey[far], LIT, atol=1e-6)
     assert np.array_equal(grey_of(model), grey_of(street(xy[seen], np.concatenate([floaters, wall]))))  # the original stays
+
+
+def test_the_shadow_of_what_stands_becomes_as_bright_as_what_lies_around() -> None:
+    xy = np.stack(np.meshgrid(np.arange(2, 30, 0.3), np.arange(-7, 7, 0.3), indexing="ij"), -1).reshape(-1, 2)
+    model, (actor, views) = street(xy, np.zeros((0, 3))), lead()
+    hidden = hidden_by(actor, views)
+    for moves in (False, True):
+        made = without_traces(model, [replace(hidden, moves=moves)])
+        means, kept = made.table["means"].detach().numpy(), made.table.labels[CERTAINTY].numpy() > 0
+        near = kept & (np.abs(means[:, 1]) < 1.4) & (means[:, 0] > 6) & (means[:, 0] < 7.2)
+        assert near.sum() > 10 and np.median(grey_of(made)[near]) == pytest.approx(SHADED if moves else LIT, abs=0.01)
 
 
 def test_lit_ground_is_never_darkened_and_what_is_seen_is_not_replaced() -> None:
@@ -90,6 +102,15 @@ def test_lit_ground_is_never_darkened_and_what_is_seen_is_not_replaced() -> None
     only = without_traces(model, [hidden_by(actor, views)])
     count = [int((m.table.labels[CERTAINTY] == 0).sum()) for m in (made, only)]
     assert count[0] < count[1]  # a camera that looks over the car leaves less to guess
+
+
+def test_a_script_says_whose_traces_go() -> None:
+    actor, _ = lead()
+    for verb, text in (("remove", "ids: [a]"), ("move", "id: a, along_m: 9")):
+        for asked in (True, False):
+            script = parse_edits(f"- {verb}: {{{text}, close_street: {str(asked).lower()}}}", "e")
+            plan = plan_edits(script, EditWorld({"a": actor}), EditSources(lambda s: None, lambda n: None))  # type: ignore[arg-type,return-value]
+            assert plan.closed == ({"a"} if asked else set())
 
 
 def test_a_scene_without_ground_or_views_stays() -> None:

@@ -64,6 +64,7 @@ class RemoveEdit(StrictRecord):
     class_: Name | None = Field(default=None, alias="class")
     moving: bool | None = None
     within_m: Positive | None = None
+    close_street: bool = False
 
     @model_validator(mode="after")
     def _either(self) -> Self:
@@ -89,6 +90,7 @@ class MoveEdit(StrictRecord):
     from_s: Number | None = None
     ramp_s: NotNegative = 1.0
     ground: bool = True
+    close_street: bool = False
 
 
 class StopEdit(StrictRecord):

@@ -5,7 +5,8 @@ Three things, for the places at which the recording has the object's box:
 * A road user drove there, so nothing stands there: Gaussians of the background in the space that its box swept are no surfaces.
 * Ground that the box hides in every view that would show it was never seen. What the fit left there is taken away, and flat Gaussians
   of the colours of the nearest ground that was seen close it.
-* Ground around the box holds its shadow. Its smooth luminance is raised to that of the ground farther away, never lowered.
+* Ground around the box of what stands holds its shadow (that of a road user on the move was recorded without it, too).
+  Its smooth luminance is raised to that of the ground farther away, never lowered.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def _repaired(model: SceneModel, one: Hidden) -> SceneModel:
     if lit.sum() < NEAREST:
         return model
     shaded = ground & ~gone & (beside <= SHADOW_M)
-    made = _brightened(model, means, shaded, lit & (beside <= SHADOW_M + AROUND_M))
+    made = model if one.moves else _brightened(model, means, shaded, lit & (beside <= SHADOW_M + AROUND_M))
     return _filled(made, gone, cells, np.flatnonzero(lit), means)
 
 

@@ -43,8 +43,9 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
     for name in without_nodes if plan.background is None else ():  # else it is gone with the street
         model = _cut_out(model, name, plan)
     model = model.without_nodes([name for name in plan.removed if name in model.node_names()])
-    if plan.background is None and plan.repairs:
-        model = without_traces(model, [hidden_by(plan.before.actors[name], plan.views) for name in (*plan.changes, *plan.removed)])
+    if plan.background is None:
+        gone = sorted(name for name in plan.closed if name in plan.before.actors)
+        model = without_traces(model, [hidden_by(plan.before.actors[name], plan.views) for name in gone])
     if plan.background is not None:
         other, pose = plan.background
         model = edited.with_background(model, other.model, pose)

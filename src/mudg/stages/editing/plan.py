@@ -121,7 +121,7 @@ class EditPlan:
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
-        repairs: whether the street is closed where an object is gone (``models/scene/uncovered.py``).
+        closed: actors of the recording without whose traces the street is to be shown (``models/scene/uncovered.py``).
     """
 
     before: EditWorld
@@ -135,7 +135,7 @@ class EditPlan:
     notes: list[dict[str, Any]] = field(default_factory=list)
     moves_ego: bool = False
     views: tuple[View, ...] = ()
-    repairs: bool = True
+    closed: set[str] = field(default_factory=set)
 
     def changed(self, name: str, motion: Motion) -> Motion:
         """The path of an actor of the recording with all that is done to it."""
@@ -176,6 +176,8 @@ def _remove(plan: EditPlan, given: Any, _: EditSources) -> None:
     for name in names:
         _actor(plan.after, name)
         _take_away(plan, name)
+        if given.close_street:
+            plan.closed.add(name)
 
 
 def _take_away(plan: EditPlan, name: str) -> None:
@@ -209,6 +211,8 @@ def _nearest_m(world: EditWorld, actor: Actor) -> float:
 
 def _move(plan: EditPlan, given: Any, _: EditSources) -> None:
     by = Displacement(given.along_m, given.left_m, given.up_m, math.radians(given.yaw_deg), given.from_s, given.ramp_s)
+    if given.close_street and given.id != EGO:
+        plan.closed.add(given.id)
     _change(plan, given.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if given.ground else None))
 
 
