@@ -129,8 +129,8 @@ def test_a_large_page_becomes_a_folder(
 ) -> None:
     monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
     made = view.run_page(PageConfig(images=0), toy[1], tmp_path / "page.html", scene=toy[0] / "scene")
-    assert made["page"] == tmp_path / "page" / "index.html"
-    assert (tmp_path / "page" / "scene-0.bin").stat().st_size > 1000
+    assert made["page"] == tmp_path / "page_page" / "index.html"
+    assert (tmp_path / "page_page" / "scene-0.bin").stat().st_size > 1000
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -207,6 +207,17 @@ def test_hidden_objects_are_gone(opened: Browser, toy: tuple[Path, Path, SceneMo
     without = opened.measure(["class"], camera="front", t=0.4, hidden=["car-1"])["class"]
     assert (with_car == ID["car"]).sum() > 20
     assert (without == ID["car"]).sum() == 0
+
+
+@pytest.mark.slow
+@needs_browser
+def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> None:
+    from mudg.data.edits import read_edits
+
+    module = "import('mudg/share').then((share) => share.editScript({hidden: new Set(['car-1', 'a \"b\"'])}))"
+    (tmp_path / "edits.yaml").write_text(opened.run(module), encoding="utf-8")
+    (edit,) = read_edits(tmp_path / "edits.yaml").edits
+    assert (edit.verb, list(edit.settings.ids)) == ("remove", ['a "b"', "car-1"])
 
 
 # the server ----------------------------------------------------------------------------------------------------------
