@@ -143,8 +143,7 @@ class FittedScene:
         import torch
 
         from mudg.core.pictures import to_bytes
-        from mudg.core.raster.rasterize import RasterConfig
-        from mudg.stages.fit import render_view
+        from mudg.stages.fitting.rendering import raster_of, render_view
 
         if not isinstance(camera, Camera):
             raise UsageError(
@@ -154,7 +153,7 @@ class FittedScene:
             )
         view = View(camera, np.asarray(world_from_cam, np.float64), float(time_s))
         with torch.no_grad():
-            seen = render_view(self._model, view, RasterConfig(backend=backend))  # type: ignore[arg-type]
+            seen = render_view(self._model, view, raster_of(self._model, backend))  # type: ignore[arg-type]
         rgb = to_bytes(seen.rgb)
         classes = None if seen.semantics is None else seen.semantics.numpy().astype(np.uint8)
         depth = np.full(rgb.shape[:2], np.nan, np.float32) if seen.depth is None else seen.depth[0].numpy()

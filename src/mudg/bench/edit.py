@@ -30,14 +30,14 @@ from mudg.bench import poses as bench_poses
 from mudg.core import metrics
 from mudg.core.edit import Motion
 from mudg.core.fusion import fuse_sweeps
-from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.core.raster.rasterize import rasterize
 from mudg.data.city import CityWorld
 from mudg.data.edits import parse_edits
 from mudg.data.scene import read_label
 from mudg.models.scene.model import SceneModel, compose
 from mudg.stages.config import BenchConfig, FuseConfig
 from mudg.stages.editing.carried import carry_out
-from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.fuse import rules_of, scene_sweeps
 
 EDITS: Final = {
@@ -145,7 +145,7 @@ def city_keys(motion: Motion, height_m: float) -> NDArray[np.float64]:
 
 
 def _rendered(model: SceneModel, view: View) -> NDArray[np.float32]:
-    return render_view(model, view, RasterConfig(near_m=NEAR_M)).rgb.permute(1, 2, 0).numpy()
+    return render_view(model, view, raster_of(model)).rgb.permute(1, 2, 0).numpy()
 
 
 def _drawn(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
@@ -155,7 +155,7 @@ def _drawn(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
     gaussians = compose(model, view.time_s, semantics=False)
     mine = (gaussians.node == model.nodes.index(model.dynamic_object(name))).float()[:, None]
     with torch.no_grad():
-        render = rasterize(replace(gaussians, extra=mine), view, RasterConfig(near_m=NEAR_M))
+        render = rasterize(replace(gaussians, extra=mine), view, raster_of(model))
     return np.zeros(0, bool) if render.extra is None else (render.extra[0] > 0.5).cpu().numpy()
 
 

@@ -34,7 +34,6 @@ from mudg.base.types import FusedCloud, Scene, Track
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.raster.place import drawing_device
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.city import CityConfig, write_city
 from mudg.data.scene import read_image, read_label, read_scene
 from mudg.models.scene.model import SceneModel
@@ -42,6 +41,7 @@ from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
 from mudg.stages.config.fit import DensifyConfig, PoseConfig, RecordedLossConfig, StartConfig
+from mudg.stages.fitting.rendering import raster_of
 from mudg.stages.fuse import rules_of, scene_sweeps
 
 LISTS: dict[str, tuple[int, ...]] = {
@@ -190,9 +190,7 @@ def moving_psnr(scene: Scene, model: SceneModel) -> float:
     for frame in scene.frames_in("test"):
         moving = torch.from_numpy(read_label(scene, frame, "dynamic").astype(bool))
         truth = torch.from_numpy(read_image(scene, frame)).permute(2, 0, 1).float() / 255
-        errors.append(
-            (fit.render_view(model, frame.view, RasterConfig(near_m=fit.NEAR_M)).rgb - truth)[:, moving].flatten()
-        )
+        errors.append((fit.render_view(model, frame.view, raster_of(model)).rgb - truth)[:, moving].flatten())
     every = torch.cat(errors) if errors else torch.zeros(0)
     return metrics.psnr(every, torch.zeros_like(every)) if len(every) else float("nan")
 

@@ -65,6 +65,7 @@ from mudg.stages.fitting.poses import refine_poses
 from mudg.stages.fitting.recipe import DrawnView
 from mudg.stages.fitting.recipes import recipe_of
 from mudg.stages.fitting.rendering import NEAR_M as NEAR_M
+from mudg.stages.fitting.rendering import check_drawing, drawing_facts, raster_of
 from mudg.stages.fitting.rendering import render_view as render_view
 from mudg.stages.fitting.schedule import appearance_rates, densify_schedule, learning_rates, pose_round_due
 from mudg.stages.fitting.storage import load_model as load_model
@@ -145,6 +146,7 @@ def run(
     if config.virtual.lpips_weights:
         inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
     device = drawing_device(config.device, "fit", config.raster)
+    check_drawing(config, device)
     folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
@@ -256,6 +258,7 @@ def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewS
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
     model = recipe_of(config.method).start(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
+    model.facts |= drawing_facts(config.drawing)
     stats = DensifyStats.zeros(len(model.table))
     return FitState(model, views, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, views))
 
@@ -284,7 +287,7 @@ def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:
 
 def add_certainty(state: FitState, config: FitConfig) -> None:
     """Note in the model how well the photographs constrain every Gaussian (``fitting/certainty.py``)."""
-    raster, most = RasterConfig(backend=config.raster, near_m=NEAR_M), max(LEAST_WITNESSES, round(WITNESS_SHARE * config.iterations))
+    raster, most = raster_of(state.model, config.raster), max(LEAST_WITNESSES, round(WITNESS_SHARE * config.iterations))
     state.model.table.labels[CERTAINTY] = certainty_of(state.model, state.views.recorded, raster, state.appearance, most)
 
 
@@ -297,7 +300,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
-    raster, perception = RasterConfig(backend=config.raster, near_m=NEAR_M), perception_of(config.virtual, state.device)
+    raster, perception = raster_of(state.model, config.raster, config.drawing.packed), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
 

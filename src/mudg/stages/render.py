@@ -21,7 +21,6 @@ from mudg.base.types import Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.edits import EditScript
 from mudg.data.exporters.video import write_mp4
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
@@ -31,7 +30,8 @@ from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
 from mudg.stages.editing.carried import FACT, carry_out, read_and_digest
 from mudg.stages.editing.weathered import Drawer, conditions_of, in_conditions
-from mudg.stages.fit import NEAR_M, load_model, render_view
+from mudg.stages.fit import load_model, render_view
+from mudg.stages.fitting.rendering import raster_of
 from mudg.stages.fitting.storage import RADIANCE, kind_of
 from mudg.stages.fitting.views import resized_view
 from mudg.stages.radiance.pictures import observe
@@ -104,7 +104,7 @@ def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str
     """What draws the views of a scene of Gaussians, and its name."""
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
-    source, raster = str(fitted.facts.get("method", "fit")), RasterConfig(backend=config.raster, near_m=NEAR_M)
+    source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
     return lambda view: render_view(fitted, view, raster, config.sky_below_alpha, source), source
 
 

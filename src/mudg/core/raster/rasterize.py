@@ -152,7 +152,7 @@ def rasterize(
     _check_views(views, config)
     poses = _poses(world_from_cam, len(views), batched, config)
     name = _choose_backend(gaussians, config)
-    _refuse_settings(name, config)
+    refuse_settings(name, config)
     flat, pixelwise = _backgrounds(background, views, batched)
     drawn = BACKENDS[name](Request(gaussians, views, batched, config, degree, flat, poses, absgrad))
     if pixelwise is None:
@@ -195,7 +195,12 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     return "torch"
 
 
-def _refuse_settings(backend: str, config: RasterConfig) -> None:
+def refuse_settings(backend: str, config: RasterConfig) -> None:
+    """Refuse settings that a backend does not draw.
+
+    Raises:
+        UsageError: one of ``ONLY_GSPLAT`` with another backend.
+    """
     for name, common in ONLY_GSPLAT.items():
         value = getattr(config, name)
         if backend != "gsplat" and value != common:

@@ -98,6 +98,22 @@ class AppearanceConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class DrawingConfig:
+    """How Gaussians are drawn while fitting; renders of the fitted scene draw them in the same way."""
+
+    antialias: bool = False
+    """Reduce the opacity of Gaussians smaller than a pixel by what the blur of the screen adds to them (Mip-Splatting). Use it if
+    renders will be larger, smaller, nearer or further than the recorded images."""
+    packed: bool = False
+    """Working memory only for Gaussians that a view sees: less memory, slightly slower. Needs gsplat."""
+    projection: Literal["linear", "unscented"] = "linear"
+    """linear: as published for 3D Gaussian Splatting. unscented: evaluated along the ray of each pixel (3DGUT). Needs gsplat and
+    densify.kind mcmc or none."""
+    primitive: Literal["ellipsoid", "disc"] = "ellipsoid"
+    """ellipsoid, or disc: flat Gaussians (2DGS). Needs gsplat and densify.kind mcmc or none."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RecordedLossConfig:
     """Loss weights of recorded views, and of the terms that every view has. 0 turns a term off."""
 
@@ -216,6 +232,7 @@ class FitConfig:
     hexplane: HexplaneConfig = Field(default_factory=HexplaneConfig)
     poses: PoseConfig = Field(default_factory=PoseConfig)
     appearance: AppearanceConfig = Field(default_factory=AppearanceConfig)
+    drawing: DrawingConfig = Field(default_factory=DrawingConfig)
     loss: RecordedLossConfig = Field(default_factory=RecordedLossConfig)
     virtual: VirtualConfig = Field(default_factory=VirtualConfig)
     radiance: RadianceConfig = Field(default_factory=RadianceConfig)

@@ -18,12 +18,11 @@ from mudg.base import geometry, log
 from mudg.base.palette import DYNAMIC_IDS, ID
 from mudg.base.types import Frame, Observation, Scene, Sweep, SweepPoints
 from mudg.core.pictures import to_bytes
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.scene import SceneWriter, read_image, read_label, read_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config.edit import EditConfig
 from mudg.stages.editing.plan import EditPlan
-from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.fitting.rendering import raster_of, render_view
 
 NOTE: Final = "edited: parts of the images are renders of a fitted scene"
 BOX_MARGIN_M: Final = 0.1
@@ -46,7 +45,7 @@ class EditedImages:
 
     def of(self, recorded: NDArray[np.uint8], frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Observation]:
         """The image u8[H, W, 3] of a frame, which of its pixels [H, W] are rendered, and the render."""
-        raster = RasterConfig(backend=self.config.raster, near_m=NEAR_M)
+        raster = raster_of(self.before, self.config.raster)
         made = render_view(self.after, frame.view, raster)
         if self.moves_ego:
             return to_bytes(made.rgb), np.ones(recorded.shape[:2], bool), made

@@ -21,6 +21,7 @@ from mudg.models.scene.appearance import CAMERA_POSE, RECORDED_COLOR, Appearance
 from mudg.models.scene.model import CERTAINTY, SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages.config import FitConfig
+from mudg.stages.fitting.rendering import DRAWING, drawing_facts
 from mudg.stages.fitting.storage import load_appearance, load_model
 
 START_METHOD = "street_gaussians"
@@ -86,13 +87,17 @@ def continued_model(start: StartFit, classes: Sequence[int], config: FitConfig) 
     """The model of a finished fit, on the CPU, with channels for all of ``classes`` (train ids) and no moments.
 
     Raises:
-        UsageError: it was fitted with other degrees of spherical harmonics.
+        UsageError: it was fitted with other degrees of spherical harmonics, or drawn with other settings.
     """
     model = load_model(start.folder)
     model.table.labels.pop(CERTAINTY, None)
     if model.sh_degree != config.sh_degree:
         raise UsageError("the finished fit has another degree of spherical harmonics", where=str(start.folder),
                          expected=str(config.sh_degree), got=str(model.sh_degree), remedy=f"add --sh-degree {model.sh_degree}")  # fmt: skip
+    drawn, wanted = model.facts.get(DRAWING, {}), drawing_facts(config.drawing).get(DRAWING, {})
+    if drawn != wanted:
+        raise UsageError("the finished fit was drawn with other settings", where=str(start.folder), expected=str(drawn or "the usual ones"),
+                         got=str(wanted or "the usual ones"), remedy="give the finished fit's --drawing settings")  # fmt: skip
     for node in model.nodes:
         if isinstance(node, RigidNode) and config.poses.learn and not node.learn_pose:
             node.learn_pose = True

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import Tensor
 
 from mudg.base import palette
+from mudg.base.errors import UsageError
 from mudg.base.types import Observation, Render, View
-from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize, refuse_settings
 from mudg.models.scene.model import SceneModel, compose, composite_semantics, composite_sky
+from mudg.stages.config.fit import DrawingConfig, FitConfig
 
 NEAR_M = 0.2
+DRAWING: Final = "drawing"
+"""Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there: the usual ones."""
 Rendered = TypeVar("Rendered")
 
 
@@ -35,6 +39,36 @@ class RenderedCondition:
     alpha: Tensor
     semantics: Tensor
     certainty: Tensor | None
+
+
+def raster_of(model: SceneModel, backend: Backend = "auto", packed: bool = False) -> RasterConfig:
+    """How a fitted scene is drawn: as it was while it was fitted."""
+    return RasterConfig(backend=backend, near_m=NEAR_M, packed=packed, **model.facts.get(DRAWING, {}))
+
+
+def drawing_facts(config: DrawingConfig) -> dict[str, Any]:
+    """What a model notes of these settings: nothing if they are the usual ones."""
+    chosen, usual = asdict(config), asdict(DrawingConfig())
+    changed = {name: value for name, value in chosen.items() if name != "packed" and value != usual[name]}
+    return {DRAWING: changed} if changed else {}
+
+
+def check_drawing(config: FitConfig, device: torch.device) -> None:
+    """Refuse before the work what no step could draw.
+
+    Raises:
+        UsageError: settings that exclude each other, that the backend of this device lacks, or that give no gradients for what is to
+            be learnt.
+    """
+    wanted = config.drawing
+    backend = config.raster if config.raster != "auto" else "gsplat" if device.type == "cuda" else "cpu"
+    refuse_settings(backend, RasterConfig(backend=config.raster, near_m=NEAR_M, **asdict(wanted)))
+    if (wanted.projection, wanted.primitive) != ("linear", "ellipsoid") and config.densify.kind == "gradient":
+        raise UsageError("this way of drawing has no gradients of projected means, by which Gaussians are added",
+                         where="--drawing", got=f"{wanted.projection}, {wanted.primitive}", remedy="add --densify.kind mcmc")  # fmt: skip
+    if wanted.projection == "unscented" and config.appearance.cameras:
+        raise UsageError("unscented projection has no gradients of camera poses", where="--appearance.cameras",
+                         remedy="leave it out, or set --drawing.projection linear")  # fmt: skip
 
 
 @torch.no_grad()
@@ -60,7 +94,7 @@ def render_condition(
         gaussians = replace(
             gaussians, extra=known if gaussians.extra is None else torch.cat([gaussians.extra, known], 1)
         )
-    render = rasterize(gaussians, view, raster or RasterConfig(near_m=NEAR_M))
+    render = rasterize(gaussians, view, raster or raster_of(model))
     blended = None
     if certainty is not None and render.extra is not None:
         blended = torch.minimum(render.extra[-1].clamp_min(0), render.alpha[0])

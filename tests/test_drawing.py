@@ -1,0 +1,93 @@
+"""How a scene is drawn while it is fitted: noted in the model, kept by renders, refused where it cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from mudg import native
+from mudg.base.errors import UsageError
+from mudg.core.raster.rasterize import RasterConfig
+from mudg.data.city import CityConfig
+from mudg.data.scene import read_scene
+from mudg.models.scene.model import compose
+from mudg.stages import fit, fuse, ingest
+from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config.fit import AppearanceConfig, DensifyConfig, DrawingConfig, StartConfig
+from mudg.stages.fitting.rendering import NEAR_M, check_drawing, raster_of, rasterize
+
+pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
+CPU = torch.device("cpu")
+USUAL = FitConfig(method="street_gaussians", iterations=4, semantics=False, start=StartConfig(gaussians=800), checkpoint_every=100)
+SMOOTH = replace(USUAL, drawing=DrawingConfig(antialias=True))
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A scene of three frames and its clouds."""
+    root = tmp_path_factory.mktemp("drawing")
+    city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",))
+    scene = ingest.run(IngestConfig(city=city, contact_sheet=False, test_every=0), "city", root / "scene")
+    return scene, fuse.run(FuseConfig(), scene, root / "fuse")
+
+
+@pytest.fixture(scope="module")
+def fits(prepared: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same few steps, drawn as usual and without added light."""
+    root = tmp_path_factory.mktemp("fits")
+    return {name: fit.run(config, *prepared, root / name) for name, config in (("usual", USUAL), ("smooth", SMOOTH))}
+
+
+def test_a_model_notes_how_it_was_drawn_if_not_as_usual(fits: dict[str, Path]) -> None:
+    facts = {name: json.loads((folder / "model.json").read_text())["facts"] for name, folder in fits.items()}
+    assert "drawing" not in facts["usual"]
+    assert facts["smooth"]["drawing"] == {"antialias": True}
+
+
+def test_renders_draw_as_the_fit_did(fits: dict[str, Path], prepared: tuple[Path, Path]) -> None:
+    model, view = fit.load_model(fits["smooth"]), read_scene(prepared[0]).frames[1].view
+    assert raster_of(model) == RasterConfig(near_m=NEAR_M, antialias=True)
+    gaussians = compose(model, view.time_s)
+    drawn = {smooth: rasterize(gaussians, view, RasterConfig(near_m=NEAR_M, antialias=smooth)).alpha for smooth in (False, True)}
+    as_noted = rasterize(gaussians, view, raster_of(model)).alpha
+    assert torch.equal(as_noted, drawn[True])
+    assert not torch.equal(drawn[True], drawn[False])  # else this test shows nothing
+    assert raster_of(fit.load_model(fits["usual"])) == RasterConfig(near_m=NEAR_M)
+
+
+def test_a_finished_fit_goes_on_only_as_it_was_drawn(fits: dict[str, Path], prepared: tuple[Path, Path], tmp_path: Path) -> None:
+    out = fit.run(SMOOTH, *prepared, tmp_path / "on", start=fits["smooth"])
+    assert json.loads((out / "model.json").read_text())["facts"]["drawing"] == {"antialias": True}
+    with pytest.raises(UsageError, match="drawn with other settings"):
+        fit.run(USUAL, *prepared, tmp_path / "other", start=fits["smooth"])
+
+
+@pytest.mark.parametrize("drawing", [{"primitive": "disc"}, {"projection": "unscented"}, {"packed": True}])
+def test_what_only_gsplat_draws_is_refused_before_anything_is_written(
+    drawing: dict[str, str], prepared: tuple[Path, Path], tmp_path: Path
+) -> None:
+    config = replace(USUAL, drawing=DrawingConfig(**drawing), densify=DensifyConfig(kind="mcmc"))
+    with pytest.raises(UsageError, match="only gsplat on a CUDA device"):
+        fit.run(config, *prepared, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_lacks_gradients_is_refused() -> None:
+    there = torch.device("cuda")
+    disc = replace(USUAL, drawing=DrawingConfig(primitive="disc"))
+    with pytest.raises(UsageError, match="gradients of projected means") as refused:
+        check_drawing(disc, there)
+    assert "--densify.kind mcmc" in str(refused.value)
+    check_drawing(replace(disc, densify=DensifyConfig(kind="mcmc")), there)
+    rays = replace(USUAL, drawing=DrawingConfig(projection="unscented"), densify=DensifyConfig(kind="none"))
+    check_drawing(rays, there)
+    with pytest.raises(UsageError, match="no gradients of camera poses"):
+        check_drawing(replace(rays, appearance=AppearanceConfig(cameras=True)), there)
+    with pytest.raises(UsageError, match="cannot combine"):
+        check_drawing(replace(USUAL, drawing=DrawingConfig(projection="unscented", primitive="disc")), there)
+    with pytest.raises(UsageError, match="only gsplat"):
+        check_drawing(replace(rays, raster="torch"), there)
