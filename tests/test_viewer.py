@@ -16,13 +16,12 @@ from toy_fitted import STREET, toy_fitted, write_toy_run
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
 from mudg.report.viewer.packed import BLOCK, blob_of, morton_codes, pack_scene, smallest_three
 from mudg.stages.config.view import PageConfig, ViewConfig
-from mudg.stages.fitting.rendering import NEAR_M, render_view
+from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import view
 from mudg.stages.viewing.server import token_for
 
@@ -157,7 +156,7 @@ def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[P
     scene, model = read_scene(toy[0] / "scene"), toy[2]
     for time_s, shift_m in ((0.0, 0.0), (0.4, 0.0), (0.4, 2.0), (0.6, -2.0), (0.8, 0.5)):
         wanted = next(v for v in at_shift(scene, "front", shift_m).views if abs(v.time_s - time_s) < 1e-6)
-        true = render_view(model, wanted, RasterConfig(near_m=NEAR_M))
+        true = render_view(model, wanted, raster_of(model))
         seen = opened.measure(["color", "depth", "class", "confidence"], camera="front", t=time_s, shift=shift_m)
         assert psnr(seen["color"][..., :3] / 255.0, true.rgb.permute(1, 2, 0).numpy()) >= 38
         depth = np.where(
@@ -280,7 +279,7 @@ def test_the_server_draws_exact_frames(served: tuple[int, str], toy: tuple[Path,
     here = {"Origin": f"http://localhost:{port}", "Host": f"localhost:{port}"}
     status, content = ask(port, "POST", "/frame", body, X_Mudg_Token=token, **here)
     assert status == 200
-    true = render_view(toy[2], wanted, RasterConfig(near_m=NEAR_M)).rgb.permute(1, 2, 0).numpy()
+    true = render_view(toy[2], wanted, raster_of(toy[2])).rgb.permute(1, 2, 0).numpy()
     assert np.abs(np.asarray(Image.open(io.BytesIO(content))) / 255.0 - true).max() < 0.003
 
 

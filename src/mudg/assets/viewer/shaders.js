@@ -14,7 +14,7 @@ precision highp float; precision highp int; precision highp usampler2D; precisio
 export const splatVertex = (degree, texels, width) => HEAD + `
 uniform usampler2D data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
-uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer;
+uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -89,6 +89,8 @@ void main() {
   float xx = dot(hx, hx) + 0.3, xy2 = dot(hx, hy), yy = dot(hy, hy) + 0.3;
   vec3 area = cross(hx, hy);
   float det = dot(area, area) + 0.3 * (xx + yy - 0.3);
+  if (antialias) opacity *= sqrt(max(dot(area, area) / det, 1e-6)); // blurring adds no light
+  if (opacity * 255.0 < 1.0) return;
   float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy2)), l1 = middle + spread, l2 = det / l1;
   vec2 along = abs(xy2) < 1e-6 * l1 ? (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0)) : normalize(vec2(xy2, l1 - xx));
   float reach = sqrt(2.0 * log(opacity * 255.0)) + 0.02;
