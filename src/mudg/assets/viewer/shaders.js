@@ -159,7 +159,11 @@ void main() {
     rgb = sum.a < 0.5 ? vec3(0.0) : texture(scales, vec2((t * 255.0 + 0.5) / 256.0, 0.5)).rgb;
   } else if (layer == 3) rgb += (1.0 - sum.a) * vec3(0.06, 0.07, 0.09);
   else if (layer == 4) rgb += (1.0 - sum.a) * vec3(0.5);
-  else if (layer == 5) { float c = clamp(sum.r, 0.0, 1.0); rgb = mix(vec3(0.55, 0.12, 0.10), mix(vec3(0.93, 0.75, 0.25), vec3(0.16, 0.60, 0.42), smoothstep(0.3, 0.9, c)), smoothstep(0.0, 0.5, c)) * (0.35 + 0.65 * sum.a); }
+  else if (layer == 5) { // below 0.1 depth is mostly wrong, above 0.4 hardly ever
+    float c = clamp(sum.r, 0.0, 1.0);
+    vec3 sure = mix(vec3(0.93, 0.75, 0.25), vec3(0.16, 0.60, 0.42), smoothstep(0.15, 0.4, c));
+    rgb = mix(vec3(0.55, 0.12, 0.10), sure, smoothstep(0.02, 0.18, c)) * (0.35 + 0.65 * sum.a);
+  }
   color = vec4(clamp(rgb, 0.0, 1.0), 1.0);
 }`;
 
