@@ -48,7 +48,7 @@ def toy_fitted(degree: int = 3, seed: int = 0) -> SceneModel:
     sky = SkyNode.uniform(8)
     fade, tint = torch.linspace(0.9, 0.3, 8)[:, None], torch.tensor([0.6, 0.8, 1.0])[:, None, None]
     sky.table.columns["panorama"] = (tint * fade * torch.ones(8, 16))[None]
-    facts = {"method": "street_gaussians", "scene": "toy-street", "classes": []}
+    facts = {"method": "street_gaussians", "scene": "toy-street", "classes": [], "drawing": {"antialias": True}}
     return SceneModel(table, (StaticNode(), _car(), _person(rng)), sky, CLASSES, degree, facts)
 
 

@@ -246,7 +246,7 @@ class PageFlags(Common):
     run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
     """Folder of a finished mudg run, or Gaussian scene written by fit."""
     out: Annotated[Path, arg(metavar="FILE.html")]
-    """Page to write: one file. Above 32 MB, a folder of the same name without .html, for a web server."""
+    """Page to write: one file. Above 32 MB, a folder FILE_page beside it, for a web server."""
     scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Scene directory that a Gaussian scene was fitted to. A run has its own."""
     compare: Annotated[Path | None, arg(metavar="RUN2")] = None

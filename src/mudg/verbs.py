@@ -135,6 +135,21 @@ def render(
     return stage.run(made, Path(scene), Path(model), Path(out), edits=_optional(edits), fused=_optional(fused), overwrite=overwrite)
 
 
+def page(
+    run: Location, out: Location, *, scene: Location | None = None, compare: Location | None = None,
+    overwrite: bool = False, config: Location | None = None, **settings: Any,
+) -> Path:  # fmt: skip
+    """Write a fitted scene as one HTML page; returns the page (``index.html`` of a folder above 32 MB).
+
+    Args:
+        scene: the log of a fit; a run has its own. compare: a second run or fit of the same log.
+    """
+    from mudg.stages.viewing import view as stage
+
+    made = _settings(stage_config.PageConfig, config, settings)
+    return stage.run_page(made, Path(run), Path(out), scene=_optional(scene), compare=_optional(compare), overwrite=overwrite)["page"]
+
+
 def edit(
     source: Location, script: Location, out: Location, *,
     scene: Location | None = None, fused: Location | None = None, overwrite: bool = False,

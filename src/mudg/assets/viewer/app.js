@@ -10,6 +10,8 @@ import { fromHash, initialState, toHash } from "mudg/state";
 const REST_MS = 180; // without a change: draw at full size
 const SLOW_MS = 45, QUICK_MS = 18; // of a frame while moving: draw smaller, or larger again
 const SMALLEST = 0.22;
+const CERTAIN = 0.2; // certainty from which on a surface is called determined by the recording
+const LONGEST_MS = 2500; // of a picture at rest: what would take longer, without a graphics card say, is drawn smaller
 const MOST_PIXELS = 2560 * 1440;
 
 export class App {
@@ -21,7 +23,8 @@ export class App {
     this.renderer = new Renderer(parts.canvas, facts);
     this.loaded = [];
     this.images = new Map();
-    this.quality = 0.5;
+    this.quality = 0.3;
+    this.wholeMs = {}; // layer -> milliseconds of a picture at full size, as far as smaller ones tell
     this.changed = 0;
     this.last = { area: [0, 0, 1, 1], view: null };
     this.listeners = new Set();
@@ -99,7 +102,11 @@ export class App {
     this.before = now;
     const resting = now - this.changed > REST_MS && !s.playing;
     if (!this.dirty && (this.sharp || !resting)) return;
-    this.draw(resting ? 1 : this.quality, resting);
+    this.draw(resting ? this.restQuality() : this.quality, resting);
+  }
+
+  restQuality() {
+    return clamp(Math.sqrt(LONGEST_MS / (this.wholeMs[this.state.layer] ?? 1)), SMALLEST, 1);
   }
 
   /** Sizes of canvas and picture in pixels: [canvas width, height, ratio]. */
@@ -127,8 +134,10 @@ export class App {
     this.renderer.present(pictures[0] ?? pictures[1] ?? this.pictureOf("left", left, small, "color"), pictures[1], below, mode, s.divider);
     this.renderer.gl.readPixels(0, 0, 1, 1, this.renderer.gl.RGBA, this.renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits: the time is the true one
     const ms = performance.now() - began;
-    if (quality < 1) this.quality = clamp(this.quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
-    else if (resting) this.rested();
+    if (this.drawnBefore) this.wholeMs[s.layer] = ms / (quality * quality); // the first one also compiles the programs
+    this.drawnBefore = true;
+    if (resting) this.rested();
+    else this.quality = clamp(quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
     this.told(ms);
   }
 
@@ -218,7 +227,7 @@ export class App {
     if (!loaded.scene.hasCertainty || !loaded.drawn) return null;
     const small = scaled(view, Math.min(1, 96 / view.width)), sums = this.renderer.read(loaded, small, this.state.t, "confidence", this.state.hidden);
     let sure = 0, covered = 0;
-    for (let i = 0; i < sums.length; i += 4) { if (sums[i + 3] >= 0.5) { covered++; if (sums[i] > 0.5) sure++; } }
+    for (let i = 0; i < sums.length; i += 4) { if (sums[i + 3] >= 0.5) { covered++; if (sums[i] > CERTAIN) sure++; } }
     return covered ? sure / covered : null;
   }
 }

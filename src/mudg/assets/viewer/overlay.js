@@ -4,6 +4,7 @@ import { add, project, turn } from "mudg/math";
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const NEAREST = 0.25;
+const LABELS_WITHIN_M = 35; // names farther away would cover one another
 
 /** A colour that belongs to a track, the same on every page. */
 export function trackColor(id) {
@@ -27,7 +28,9 @@ export class Overlay {
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.thumbnails = [];
-    if (!(state.boxes || state.paths || state.lidar || state.cameras || state.selected)) return;
+    const empty = !(state.boxes || state.paths || state.lidar || state.cameras || state.selected);
+    this.canvas.style.visibility = empty ? "hidden" : "visible"; // a canvas that is only cleared may keep its old picture on the screen
+    if (empty) return;
     c.save();
     c.beginPath();
     c.rect(...area);
@@ -85,6 +88,7 @@ export class Overlay {
     c.beginPath();
     for (const k of [4, 5, 7, 6]) c.lineTo(corners[k][0], corners[k][1]);
     c.fill();
+    if (!chosen && corners[0][2] > LABELS_WITHIN_M) return;
     const top = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best));
     const speed = track.pose.speed(t), text = `${track.id} ${track.label}${speed > 0.2 ? ` ${(speed * 3.6).toFixed(0)} km/h` : ""}`;
     c.font = `${12 * this.ratio}px system-ui, sans-serif`;

@@ -189,6 +189,7 @@ export class Renderer {
     gl.uniform1f(places.harmonicStep, loaded.scene.facts.harmonic_step ?? 0);
     gl.uniform1f(places.nearest, NEAR_M);
     gl.uniform1i(places.layer, layer);
+    gl.uniform1i(places.antialias, loaded.scene.facts.antialias ? 1 : 0);
     set(places);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);

@@ -14,7 +14,7 @@ precision highp float; precision highp int; precision highp usampler2D; precisio
 export const splatVertex = (degree, texels, width) => HEAD + `
 uniform usampler2D data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
-uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer;
+uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -89,6 +89,8 @@ void main() {
   float xx = dot(hx, hx) + 0.3, xy2 = dot(hx, hy), yy = dot(hy, hy) + 0.3;
   vec3 area = cross(hx, hy);
   float det = dot(area, area) + 0.3 * (xx + yy - 0.3);
+  if (antialias) opacity *= sqrt(max(dot(area, area) / det, 1e-6)); // blurring adds no light
+  if (opacity * 255.0 < 1.0) return;
   float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy2)), l1 = middle + spread, l2 = det / l1;
   vec2 along = abs(xy2) < 1e-6 * l1 ? (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0)) : normalize(vec2(xy2, l1 - xx));
   float reach = sqrt(2.0 * log(opacity * 255.0)) + 0.02;
@@ -157,7 +159,11 @@ void main() {
     rgb = sum.a < 0.5 ? vec3(0.0) : texture(scales, vec2((t * 255.0 + 0.5) / 256.0, 0.5)).rgb;
   } else if (layer == 3) rgb += (1.0 - sum.a) * vec3(0.06, 0.07, 0.09);
   else if (layer == 4) rgb += (1.0 - sum.a) * vec3(0.5);
-  else if (layer == 5) { float c = clamp(sum.r, 0.0, 1.0); rgb = mix(vec3(0.55, 0.12, 0.10), mix(vec3(0.93, 0.75, 0.25), vec3(0.16, 0.60, 0.42), smoothstep(0.3, 0.9, c)), smoothstep(0.0, 0.5, c)) * (0.35 + 0.65 * sum.a); }
+  else if (layer == 5) { // below 0.1 depth is mostly wrong, above 0.4 hardly ever
+    float c = clamp(sum.r, 0.0, 1.0);
+    vec3 sure = mix(vec3(0.93, 0.75, 0.25), vec3(0.16, 0.60, 0.42), smoothstep(0.15, 0.4, c));
+    rgb = mix(vec3(0.55, 0.12, 0.10), sure, smoothstep(0.02, 0.18, c)) * (0.35 + 0.65 * sum.a);
+  }
   color = vec4(clamp(rgb, 0.0, 1.0), 1.0);
 }`;
 

@@ -47,6 +47,19 @@ export function recordVideo(app, say) {
   say("Recording. Pause to end it.");
 }
 
+/** What is hidden on the page as an edit script for `mudg edit` and `mudg render --edits`; empty where nothing is. */
+export function editScript(state) {
+  return state.hidden.size ? `- remove: {ids: ${JSON.stringify([...state.hidden].sort())}}\n` : "";
+}
+
+/** Saves the edit script. */
+export function saveEdits(app) {
+  const text = editScript(app.state);
+  if (!text) return "Nothing is hidden: hide objects first.";
+  save(new Blob([text], { type: "application/yaml" }), "edits.yaml");
+  return "Saved edits.yaml for mudg edit.";
+}
+
 /** Puts a link to what is shown into the clipboard. */
 export async function saveLink(app) {
   history.replaceState(null, "", toHash(app.state));

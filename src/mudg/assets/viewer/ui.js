@@ -4,7 +4,7 @@ import { MODES } from "mudg/cameras";
 import { LAYERS } from "mudg/shaders";
 import { clamp, project } from "mudg/math";
 import { trackColor } from "mudg/overlay";
-import { recordVideo, saveLink, savePicture } from "mudg/share";
+import { recordVideo, saveEdits, saveLink, savePicture } from "mudg/share";
 
 const LAYER_NAMES = { color: "Color", depth: "Depth", class: "Classes", instance: "Objects", normal: "Normals", confidence: "Confidence", recorded: "Recorded" };
 const OVERLAYS = { boxes: "Boxes", paths: "Trajectories", lidar: "LiDAR", cameras: "Recorded cameras" };
@@ -141,6 +141,7 @@ export class Controls {
     $("filter").oninput = ({ target }) => {
       for (const item of list.children) item.hidden = !item.dataset.name.includes(target.value.toLowerCase());
     };
+    $("edits").onclick = () => this.say(saveEdits(app));
     $("all").onclick = () => { app.state.hidden.clear(); app.change(); };
   }
 
@@ -192,6 +193,7 @@ export class Controls {
   /** Brings all controls in line with the state. */
   show() {
     const { app } = this, s = app.state;
+    $("edits").disabled = !s.hidden.size;
     $("mode").value = s.mode;
     $("camera").value = s.camera;
     $("compare").value = s.compare;

@@ -101,17 +101,23 @@ def pack_scene(model: SceneModel, begin_s: float, path: NDArray[np.floating] | N
         panorama = model.sky.table["panorama"].detach()[0].numpy()
         sections["sky"] = to_u8(panorama.transpose(1, 2, 0))
         facts["sky_rows"] = model.sky.rows
+    facts["antialias"] = bool(_drawing(model).get("antialias", False))
     facts["nodes"], moving = motion_sections(model, begin_s)
     return Packed(sections | moving, facts, len(node), len(rows), _notes(model))
 
 
+def _drawing(model: SceneModel) -> Mapping[str, Any]:
+    """The settings of the rasterizer that the scene was fitted with, where they are not the usual ones."""
+    return model.facts.get("drawing", {})
+
+
 def _notes(model: SceneModel) -> tuple[str, ...]:
-    inexact = (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)
-    if any(isinstance(node, inexact) for node in model.nodes):
-        return (
-            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them.",
-        )
-    return ()
+    notes = []
+    if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
+        notes.append("Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them.")
+    if set(_drawing(model)) - {"antialias", "packed"}:
+        notes.append("This scene was fitted to be drawn along rays or as discs. The page draws the usual ellipsoids.")
+    return tuple(notes)
 
 
 def _worth(columns: Mapping[str, Any], opacity: Any, node: Any, path: Any) -> NDArray[np.float64]:

@@ -16,11 +16,9 @@ from pydantic import Field
 from mudg.base.records import Number, StrictRecord
 from mudg.base.types import Camera, View
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
-from mudg.core.raster.rasterize import RasterConfig
 from mudg.models.scene.model import SceneModel
 from mudg.report.page import FAR_M, NEAR_M
-from mudg.stages.fitting.rendering import NEAR_M as NEAREST_M
-from mudg.stages.fitting.rendering import render_view
+from mudg.stages.fitting.rendering import raster_of, render_view
 
 LAYERS: Final = ("color", "depth", "class")
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -62,7 +60,7 @@ class FrameSource:
         gone = [name for name in asked.hidden if name in model.node_names()]
         with self._lock, torch.no_grad():
             shown = model.without_nodes(gone) if gone else model
-            seen = render_view(shown, self._view(asked), RasterConfig(near_m=NEAREST_M))
+            seen = render_view(shown, self._view(asked), raster_of(model))
         content = io.BytesIO()
         Image.fromarray(_picture(seen, asked.layer)).save(content, "PNG", compress_level=1)
         return content.getvalue()

@@ -59,7 +59,7 @@ def run_page(
     refuse_overlap(out, {"run": run if not _inside(out, run) else None, "scene": scene, "compare": compare})
     if out.suffix != ".html":
         raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
-    folder = out.with_suffix("")
+    folder = out.with_name(f"{out.stem}_page")
     for path in (out, folder):
         if path.exists() and not overwrite:
             raise UsageError("the output exists", where=str(path), remedy="choose another --out, or add --overwrite")
