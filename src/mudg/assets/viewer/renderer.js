@@ -187,6 +187,7 @@ export class Renderer {
     gl.uniform3fv(places.eye, view.eye);
     gl.uniform2f(places.colorRange, loaded.scene.facts.color_low, loaded.scene.facts.color_high);
     gl.uniform1f(places.harmonicStep, loaded.scene.facts.harmonic_step ?? 0);
+    gl.uniform1i(places.turning, loaded.scene.facts.harmonics_in_world ? 0 : 1); // colours turn with their object
     gl.uniform1f(places.nearest, NEAR_M);
     gl.uniform1i(places.layer, layer);
     gl.uniform1i(places.antialias, loaded.scene.facts.antialias ? 1 : 0);

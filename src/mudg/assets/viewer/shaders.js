@@ -14,7 +14,7 @@ precision highp float; precision highp int; precision highp usampler2D; precisio
 export const splatVertex = (degree, texels, width) => HEAD + `
 uniform usampler2D data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
-uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias;
+uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -106,7 +106,7 @@ void main() {
   if (layer == 0) {
     uvec3 levels = uvec3(second.w, second.w >> 8, second.w >> 16) & 255u;
     payload.rgb = mix(vec3(colorRange.x), vec3(colorRange.y), vec3(levels) / 255.0);
-    ${degree ? "payload.rgb += harmonics(normalize(fromEye));" : ""}
+    ${degree ? "payload.rgb += harmonics(normalize(turning ? fromEye * worldFromNode : fromEye));" : ""}
     payload.rgb = max(payload.rgb, 0.0);
   } else if (layer == 1) payload.rgb = vec3(c.z);
   else if (layer == 3) payload.rgb = tint(node);

@@ -97,6 +97,7 @@ def pack_scene(model: SceneModel, begin_s: float, path: NDArray[np.floating] | N
         sections["certainty"] = to_u8(model.certainty.float().numpy()[rows])
     if model.sh_degree:
         facts["harmonic_step"], sections["harmonics"] = _harmonics(columns["sh_rest"][rows])
+        facts["harmonics_in_world"] = model.harmonics_in_world
     if model.sky is not None:
         panorama = model.sky.table["panorama"].detach()[0].numpy()
         sections["sky"] = to_u8(panorama.transpose(1, 2, 0))
