@@ -156,7 +156,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
     model = MDM(learn_models.model_config(tiny(clips)))
     learn_models.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
-    rules = LossSettings(learn_clips.class_weights(clips, 2, 0.5), refined_share=0.5, reference_dropout=0.2)
+    rules = LossSettings(learn_clips.class_weights(clips, range(2), 0.5), refined_share=0.5, reference_dropout=0.2)
 
     def loss(part, step):
         drawn = learn_clips.draw_clips(settings, clips, step, 4, 2, "batch", part)

@@ -320,10 +320,10 @@ def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
     front = next(view for view in log.world.frame_views("front"))
     assert (front.camera.width, front.camera.height) == (144, 96)
     made = from_city.make_clips(rules, city, log, flat_render)
-    for clip in made:
+    for number, clip in enumerate(made):
         fine = clip.fine
         assert (fine.scale, *fine.clip.rgb.shape[-2:]) == (3, 60, 60)
-        view = from_city.shifted_view(log.world, log.world.frame_views("front")[from_city.FIRST], clip.shift_m)
+        view = from_city.shifted_view(log.world, log.world.frame_views("front")[from_city.start_of(rules, city, number)], clip.shift_m)
         truth = torch.from_numpy(log.truth(view).rgb).permute(2, 0, 1).float()
         rows, columns = (slice(3 * start, 3 * start + 60) for start in (fine.row, fine.column))
         assert torch.equal(fine.clip.rgb[0], truth[:, rows, columns])

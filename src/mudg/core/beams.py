@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from mudg.base import geometry
 from mudg.core.ground import HeightMap
@@ -25,7 +25,7 @@ def ball_sizes(xyz: Array) -> Array:
     """Radii f64[N] of the balls that points f64[N, 3] of a surface stand for, metres."""
     if len(xyz) <= NEIGHBOURS:
         return np.full(len(xyz), LARGEST_M)
-    apart = cKDTree(xyz).query(xyz, NEIGHBOURS + 1)[0][:, -1]
+    apart = KDTree(xyz).query(xyz, NEIGHBOURS + 1)[0][:, -1]
     return np.asarray(apart, np.float64).clip(SMALLEST_M, LARGEST_M)
 
 
