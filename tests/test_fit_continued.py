@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,6 @@ import torch
 from fit_settings import fit_config
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
-from mudg import native
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
@@ -27,7 +24,6 @@ from mudg.models.scene.appearance import Appearance
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import continued
-from mudg.stages.fitting.together import side_by_side_calls
 
 SIZE = (60, 40)
 FRAMES = 6
@@ -81,7 +77,7 @@ def test_it_starts_from_the_finished_scene_and_learns_from_virtual_views_at_once
 
     monkeypatch.setattr(fit, "_learn_from", spy)
     one = go_on(world, tmp_path / "one", settings(iterations=1, virtual__continued_probability=1.0, virtual__stop=1.0))
-    assert sorted(kind for _, kind in seen) == ["recorded", "virtual"]
+    assert [kind for _, kind in seen] == ["recorded", "virtual"]
     old, new = fit.load_model(world["plain"]), fit.load_model(one)
     added = len(new.table) - len(old.table)
     assert added > 0  # Gaussians at surfaces that only virtual views show
@@ -102,45 +98,6 @@ def test_the_steps_are_the_second_half_of_a_run(monkeypatch):
     assert config.virtual.probability == FitConfig().virtual.continued_probability
     schedule = fit.densify_schedule(config)
     assert schedule.due(600) and not schedule.due(601 + schedule.every)
-
-
-def test_views_side_by_side_give_the_same_scene_to_the_bit(world, tmp_path):
-    before, made = native.threads(), {}
-    try:
-        for threads in (1, 2):
-            native.set_threads(threads)
-            made[threads] = go_on(world, tmp_path / str(threads))
-            assert native.threads() == threads
-    finally:
-        native.set_threads(before)
-    assert [(made[1] / name).read_bytes() for name in FILES] == [(made[2] / name).read_bytes() for name in FILES]
-
-
-def test_calls_side_by_side_run_at_the_same_time_and_end_before_an_error_is_raised():
-    before, meeting, ended = native.threads(), threading.Barrier(2, timeout=30), []
-
-    def fails():
-        meeting.wait()  # passes only if the other call runs, too
-        raise ValueError("first")
-
-    def works():
-        meeting.wait()
-        time.sleep(0.05)
-        ended.append("second")
-
-    try:
-        native.set_threads(3)
-        with side_by_side_calls(True) as together:
-            with pytest.raises(ValueError, match="first"):
-                together([fails, works])
-            assert ended == ["second"] and native.threads() == 3
-            assert together([native.threads, native.threads]) == [2, 2]
-            with pytest.raises(ValueError, match="first"):
-                together([works, fails])
-    finally:
-        native.set_threads(before)
-    with side_by_side_calls(False) as one_by_one:
-        assert one_by_one([lambda: threading.current_thread().name] * 2) == [threading.current_thread().name] * 2
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(world, tmp_path, monkeypatch):

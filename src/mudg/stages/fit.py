@@ -16,7 +16,6 @@ With ``start`` it goes on with a finished fit (``fitting/continued.py``).
 from __future__ import annotations
 
 import contextlib
-import functools
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -28,7 +27,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mudg import native
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.config import result_settings
 from mudg.base.devices import choose_device, memory_of
@@ -317,7 +315,6 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
         Interruption() as interruption,
         # The one way to the device; results come back in fitting/rendering.py.
         chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
-        side_by_side_calls(native.threads() > 1 and state.device.type == "cpu" and not config.virtual.densify) as at_once,
     ):
         while state.step < config.iterations:
             began = time.perf_counter()
@@ -326,12 +323,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 start_unseen_gaussians(state, config, raster)
             views = next(upcoming)
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            learnt = at_once([
-                functools.partial(_learn_from, state, view, LearnStep(config, raster, perception, check, step, view is views[0]))
-                for view in views
-            ])  # fmt: skip
-            # Both views have added to the same gradients by now.
-            check.gradients(" and ".join(view.name for view in views), state.model, state.appearance)
+            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
             state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
@@ -399,6 +391,7 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Rende
     terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(state, gaussians, view, config, raster, step)
     how.check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
+    how.check.gradients(view.name, state.model, state.appearance)
     if growing:
         camera = view.view.camera
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None

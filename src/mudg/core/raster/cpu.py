@@ -7,7 +7,6 @@ dropped); contexts are then reused, so that a training loop allocates once. Imag
 from __future__ import annotations
 
 import ctypes
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -85,7 +84,6 @@ class _Loan:
     """Keeps borrowed memory out of the free list until the last tensor over it is gone."""
 
     free: ClassVar[list[Tensor]] = []
-    choosing: ClassVar[threading.Lock] = threading.Lock()
 
     def __init__(self, block: Tensor) -> None:
         self.block = block
@@ -105,12 +103,11 @@ def _recycled_like(tensor: Tensor) -> Tensor:
     count = tensor.numel()
     if count * tensor.element_size() < _RECYCLE_FROM_BYTES:
         return torch.empty_like(tensor)
-    with _Loan.choosing:
-        fitting = [i for i, block in enumerate(_Loan.free) if count <= block.numel() <= 1.5 * count]
-        block = _Loan.free.pop(fitting[0]) if fitting else None
-        if block is None:
-            _Loan.free.clear()  # blocks of a size that is no longer asked for
-    if block is None:
+    fitting = [i for i, block in enumerate(_Loan.free) if count <= block.numel() <= 1.5 * count]
+    if fitting:
+        block = _Loan.free.pop(fitting[0])
+    else:
+        _Loan.free.clear()  # blocks of a size that is no longer asked for
         block = torch.empty(count + count // 8)
     memory = (_F * count).from_address(block.data_ptr())
     # The tensor keeps `memory` alive, and that the loan.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-import threading
 from collections.abc import Callable, Mapping
 
 import torch
@@ -24,7 +23,7 @@ Complaint = Callable[[float], None]
 
 
 class FiniteCheck:
-    """The numbers of one step that must be finite, in the order in which they were computed; any thread may add some.
+    """The numbers of one step that must be finite, in the order in which they were computed.
 
     Args:
         step: for messages.
@@ -35,7 +34,6 @@ class FiniteCheck:
         self._step = step
         self._at_once = at_once
         self._added: list[tuple[Tensor, Complaint]] = []
-        self._lock = threading.Lock()
 
     def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
         """Add the loss terms of a view."""
@@ -47,7 +45,7 @@ class FiniteCheck:
         )
 
     def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
-        """Add the gradients after the backward passes of these views, by their sums: the cheapest pass over memory there is."""
+        """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there is."""
         learnt = {"gaussians": (model.table, SCENE_REMEDY)}
         learnt |= {owner: (table, SCENE_REMEDY) for owner, table in model.node_tables().items()}
         learnt |= {f"appearance {group}": (table, VIEW_REMEDY) for group, table in appearance.tables.items()}
@@ -58,8 +56,7 @@ class FiniteCheck:
 
     def refuse(self) -> None:
         """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been touched."""
-        with self._lock:
-            added, self._added = self._added, []
+        added, self._added = self._added, []
         if added:
             numbers = torch.stack([number for number, _ in added]).tolist()
             for number, (_, complain) in zip(numbers, added):
@@ -70,8 +67,7 @@ class FiniteCheck:
         return f"view {view}, step {self._step}"
 
     def _add(self, numbers: list[tuple[Tensor, Complaint]]) -> None:
-        with self._lock:
-            self._added += numbers
+        self._added += numbers
         if self._at_once:
             self.refuse()
 
