@@ -23,13 +23,13 @@ from mudg.data.observations import ObservationSet, list_observation_sets, read_o
 from mudg.report.page import FPS, PANEL_ROWS, Adaptation, TrajectoryVideo, page
 from mudg.report.panels import panel_grid, panel_size
 
-PANEL_WIDTH: Final = 416
-BUDGET_BYTES: Final = 16 * 2**20
-"""For all videos together, before base64; the page stays under 25 MB."""
+PANEL_WIDTH: Final = 320
+BUDGET_BYTES: Final = 9 * 2**19
+"""For all videos together, before base64; with the posters the page stays under 8 MB."""
 VIEWER: Final = "viewer.html"
 SAME_TIME_S: Final = 1e-4
 ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
-ENCODING: Final = Encoding(FPS, first_crf=27, last_crf=45, preset="veryfast")
+ENCODING: Final = Encoding(FPS, first_crf=33, last_crf=45, preset="veryfast")
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Pat
     size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
     order = list(folders)
     video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
-    poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=70)
+    poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
     return TrajectoryVideo(
         name=trajectory["name"], camera=str(trajectory["camera"]), shift_m=trajectory["shift_m"], width=size[0], height=size[1],
         frames=columns.frames, panels={column: _rows(columns, column) for column in columns.sets},

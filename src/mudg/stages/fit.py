@@ -70,7 +70,6 @@ from mudg.stages.fitting.rendering import render_view as render_view
 from mudg.stages.fitting.schedule import appearance_rates, densify_schedule, learning_rates, pose_round_due
 from mudg.stages.fitting.storage import load_model as load_model
 from mudg.stages.fitting.storage import save_appearance, save_model
-from mudg.stages.fitting.together import side_by_side_calls
 from mudg.stages.fitting.trust import unseen_maps, unseen_rows
 from mudg.stages.fitting.views import (
     StoredView,
