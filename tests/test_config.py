@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base import config
 from mudg.base.errors import InputError, UsageError
-from mudg.stages.config import BenchConfig, FuseConfig, SynthesizeConfig
+from mudg.stages.config import BenchConfig, FuseConfig, RenderConfig, SynthesizeConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=config.STRICT)
@@ -43,6 +43,13 @@ def test_unknown_key_suggests_the_nearest_name(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("inner: {itertions: 20}\n")
     with pytest.raises(UsageError, match=r"inner\.iterations"):
         config.load(Outer, None, tmp_path / "c.yaml")
+
+
+@pytest.mark.parametrize("number", [".nan", ".inf", "-.inf"])
+def test_no_number_of_any_verb_may_be_nan_or_infinite(tmp_path: Path, number: str) -> None:
+    (tmp_path / "c.yaml").write_text(f"shifts_m: [2, {number}]")
+    with pytest.raises(UsageError, match=r"shifts_m[\s\S]*finite"):
+        config.load(RenderConfig, None, tmp_path / "c.yaml")
 
 
 @pytest.mark.parametrize("text", ["inner: {iterations: 0}", "inner: {iterations: many}", "seed: [1]"])

@@ -11,8 +11,8 @@ from fit_settings import fit_config
 
 from mudg.base import geometry, store
 from mudg.data.scene import check_scene, read_image, read_points, read_scene
-from mudg.stages import edit, fit, fuse, ingest
-from mudg.stages.config import EditConfig, FuseConfig, IngestConfig
+from mudg.stages import annotate, edit, fit, fuse, ingest
+from mudg.stages.config import AnnotateConfig, EditConfig, FuseConfig, IngestConfig
 
 pytestmark = pytest.mark.slow
 LEAD = "0"
@@ -21,7 +21,8 @@ LEAD = "0"
 @pytest.fixture(scope="module")
 def drive(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
-    ingest.run(IngestConfig(resolution="320", contact_sheet=False), shared_data("kitti_2011_09_26"), root / "scene")
+    ingest.run(IngestConfig(resolution="320", contact_sheet=False), shared_data("kitti_2011_09_26"), root / "raw")
+    annotate.run(AnnotateConfig(), root / "raw", root / "scene")  # classes tell what is ground
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
     fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")

@@ -393,6 +393,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         # Idle OpenMP threads that spin would take the cores from the native library's threads; must precede torch.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a wrong flag is told in our words
         args = parse(words)
         log.set_quiet(args.quiet)
         if words[0] not in ("doctor", "fuse"):  # they do without torch

@@ -21,11 +21,11 @@ from mudg.base.records import first_problem
 
 Config = TypeVar("Config")
 
-STRICT = ConfigDict(extra="forbid", defer_build=True)
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
 """Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``.
 
-Validators are built at their first use: a command builds only those of its own verb. A default that is itself a
-configuration is therefore a ``default_factory``."""
+No number may be NaN or infinite. Validators are built at their first use: a command builds only those of its own verb. A
+default that is itself a configuration is therefore a ``default_factory``."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:

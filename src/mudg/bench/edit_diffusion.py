@@ -41,7 +41,7 @@ from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, HarmonizeCon
 from mudg.stages.editing.assets import write_asset
 from mudg.stages.editing.carried import EditedDrive, carry_out
 from mudg.stages.editing.harmonised import repairing
-from mudg.stages.editing.written import EditedImages, write_edited_scene
+from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_scene
 from mudg.stages.fitting.continued import StartFit, whole_run
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.fitting.storage import save_model
@@ -113,8 +113,8 @@ def _script(case: EditCase, text: str, out: Path) -> EditScript:
 def _refitted(config: BenchConfig, case: EditCase, edited: tuple[EditedDrive, EditedImages], out: Path) -> SceneModel:
     """The edited fit after as many steps again on the repaired images; as `mudg fit --start-from` on an edited run does it."""
     drive, images = edited
-    if not (out / "scene" / "scene.json").is_file():
-        write_edited_scene(case.scene, drive.scene or case.scene, drive.plan, images, out / "scene")
+    if not (out / "scene" / "scene.json").is_file() and drive.scene is not None and drive.cloud is not None:  # both were given
+        write_edited_scene(case.scene, DriveChange(drive.plan, drive.scene, drive.cloud), images, out / "scene")
     save_model(images.after, out / "start")
     scene, start = read_scene(out / "scene"), StartFit(out / "start", "")
     settings = replace(bench_poses.fit_settings(config, "fixed"), iterations=config.pose_iterations)
