@@ -129,7 +129,8 @@ def test_ground_continues_ground_and_what_is_above_continues_what_is_above() -> 
     ground = torch.full((16, 16), torch.nan)
     ground[8:] = 10.0
     spoilt = torch.where(hole, torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)), color)
-    filled, classes = clip_parts.continued(spoilt, torch.where(hole, ID["car"], ids), clip_parts.Vacated(hole, ground, hole & False), hole)
+    vacated = clip_parts.Vacated(hole, ground, hole & False, hole)
+    filled, classes = clip_parts.continued(spoilt, torch.where(hole, ID["car"], ids), vacated, hole)
     assert torch.allclose(filled, color, atol=1e-5) and torch.equal(classes, ids)
 
 

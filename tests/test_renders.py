@@ -14,7 +14,7 @@ from mudg import native
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.renders import RenderPlanes
-from mudg.base.types import Camera, FusedCloud, Photo, PointCloud
+from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, Track
 from mudg.data.clips import condition as clips
 from mudg.data.clips import from_city
 from mudg.data.clips import shards as clip_shards
@@ -62,24 +62,77 @@ def test_planes_have_one_shape():
 
 
 def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
-    """A wall at 12 m whose upper part no point was measured on; the render says 40 m and red, all over."""
+    """A wall at 12 m whose upper part no point was measured on; the render says 12.5 m and red, all over."""
     cloud, view = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {}), view_at()
+    render = lambda view: flat_render(view, 12.5)  # noqa: E731
     plain = build_conditions(cloud, [], [view], [], RULES)[0]
-    helped = build_conditions(cloud, [], [view], [], RULES, render_at=flat_render)[0]
+    helped = build_conditions(cloud, [], [view], [], RULES, render_at=render)[0]
     measured = plain.valid[0, 0]
     near = torch.from_numpy(ndimage.binary_dilation(measured.numpy(), iterations=RULES.measured_reach_px))
     assert bool((near & ~measured).any()) and bool((~near).any())
     assert torch.equal(helped.valid, plain.valid)
     assert torch.equal(helped.depth[0, 0][near], plain.depth[0, 0][near])
-    assert bool((helped.depth[0, 0][~near] == 40.0).all())
-    assert bool((plain.depth[0, 0][~near] < 13.0).all())
+    assert bool((helped.depth[0, 0][~near] == 12.5).all())
+    assert bool((plain.depth[0, 0][~near] < 12.4).all())
     assert torch.equal(helped.color[0][:, near], plain.color[0][:, near])
     assert torch.allclose(helped.color[0][:, ~near], torch.tensor([[0.8], [0.2], [0.1]]))
     assert bool((helped.semantics[0, 0][~near] == 2).all())
     assert torch.equal(helped.semantics[0, 0][near], plain.semantics[0, 0][near])
     assert plain.renders is None
-    shown = flat_render(view)
+    shown = render(view)
     assert torch.equal(helped.renders.color[0], shown.color) and torch.equal(helped.renders.depth[0], shown.depth)
+
+
+@pytest.mark.parametrize(("alpha", "depth"), [(1.0, 40.0), (1.0, 4.0), (0.8, 40.0), (1.0, 12.5)])
+def test_the_outline_of_a_measured_surface_is_that_of_the_render(alpha, depth):
+    """A board 12 m away, measured on every third row and column. Beside it the render's surface stands, if it covers the pixel and is
+    another one; between measured pixels the board goes on, whatever the render shows there."""
+    cloud, view = FusedCloud(wall(12.0, stripes, y_range=(-2, 2), z_range=(-1, 1), step=0.9), {}), view_at()
+    made = build_conditions(cloud, [], [view], [], RULES, render_at=lambda view: flat_render(view, depth, alpha))[0]
+    measured = made.valid[0, 0].numpy()
+    rows, columns = np.nonzero(measured)
+    board = np.zeros_like(measured)
+    board[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+    assert (board & ~measured).sum() > 50
+    beside = ndimage.binary_dilation(measured, iterations=RULES.measured_reach_px) & ~board
+    assert beside.sum() > 50
+    z = made.depth[0, 0].numpy()
+    assert np.allclose(z[board], 12.0)
+    assert np.allclose(z[beside], depth if alpha > RULES.sure_alpha and depth != 12.5 else 12.0)
+
+
+def test_ground_between_measured_rows_is_level():
+    """Rings of road points 1.6 m below the camera, half a metre apart: between them the depth is that of the plane."""
+    x, y = np.meshgrid(np.arange(3.0, 9.0, 0.5), np.arange(-10, 10, 0.02))
+    xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
+    cloud = PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID["road"], np.uint8))
+    view = view_at()
+    falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
+    made = build_conditions(FusedCloud(cloud, {}), [], [view], [], RULES, render_at=lambda view: flat_render(view, 1000.0, 0.0))[0]
+    between = ~made.valid[0, 0] & (falls > 1.6 / 6.0) & (falls < 1.6 / 4.4)
+    assert int(between.sum()) > 40
+    exact = 1.6 / falls[between]
+    level = (made.depth[0, 0][between] / exact - 1).abs()
+    assert float(level.max()) < 0.04  # of half a row: where in its pixel the measured point lies
+
+
+def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
+    """A car 10 m ahead of which one point was measured; the render shows all of it. A photograph of one second earlier, when the car was
+    elsewhere, must not colour it."""
+    corner = PointCloud(np.array([[-1.9, 0.0, 0.0]], np.float32), np.full((1, 3), 90, np.uint8), "object")
+    poses = np.stack([np.eye(4)] * 2)
+    poses[0, :3, 3], poses[1, :3, 3] = (12.0, -6.0, 0.0), (12.0, 0.0, 0.0)
+    track = Track("car", "car", np.array([4.0, 4.0, 4.0]), np.array([0.0, 1.0]), poses)
+    cloud, now = FusedCloud(NOTHING.static, {"car": corner}), view_at(time_s=1.0)
+    car = lambda view: flat_render(view, 10.1, label=palette.ID["car"])  # noqa: E731
+    green = Photo(view_at(), np.full((32, 48, 3), (0, 255, 0), np.uint8))
+    made = build_conditions(cloud, [track], [now], [green], RULES, render_at=car)[0]
+    across = (torch.arange(48) + 0.5 - 24).abs() / 40 * 10.1
+    high = (torch.arange(32) + 0.5 - 16).abs() / 40 * 10.1
+    in_box = (across[None] < 1.8) & (high[:, None] < 1.8)
+    beside = (across[None] > 2.6) & (high[:, None] < 1.8) & (torch.arange(48) < 24)  # to the right it stood then
+    assert not bool(made.warped[0, 0][in_box].any())
+    assert bool(made.warped[0, 0][beside].all())
 
 
 @pytest.mark.parametrize(("alpha", "depth", "expected"), [(0.4, 40.0, "far"), (0.6, 40.0, 40.0), (1.0, 5000.0, "far")])

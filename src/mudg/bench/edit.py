@@ -35,6 +35,7 @@ from mudg.data.city import CityWorld
 from mudg.data.edits import parse_edits
 from mudg.data.scene import read_label
 from mudg.models.scene.model import SceneModel, compose
+from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FuseConfig
 from mudg.stages.editing.carried import carry_out
 from mudg.stages.fitting.rendering import raster_of, render_view
@@ -88,8 +89,9 @@ def case_of(config: BenchConfig, city: int, out: Path) -> EditCase:
     scene = bench_poses.city_scene(city, out / "cities" / str(city))
     cloud = fuse_sweeps(scene_sweeps(scene, FuseConfig()), scene.tracks, rules_of(FuseConfig()))[0]
     settings = bench_poses.fit_settings(config, "fixed")
-    model = bench_poses.fitted(scene, cloud, settings, out / "fits" / f"{city}_edit").model
-    return EditCase(city, CityWorld.from_source(scene.source), scene, model, most_visible(scene, model))
+    state = bench_poses.fitted(scene, cloud, settings, out / "fits" / f"{city}_edit")
+    fit.add_certainty(state, settings)
+    return EditCase(city, CityWorld.from_source(scene.source), scene, state.model, most_visible(scene, state.model))
 
 
 def most_visible(scene: Scene, model: SceneModel) -> str:

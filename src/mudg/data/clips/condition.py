@@ -73,6 +73,10 @@ class ConditionRules:
     """Side of the square with which points hide what lies behind them."""
     measured_reach_px: int = 4
     """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is one."""
+    sure_alpha: float = 0.9
+    """A pixel near to a measured one takes the depth of the render all the same where the render covers it by more than this ..."""
+    another_surface: float = 0.1
+    """... and is farther from the measured depth than this share of it: the outlines of surfaces are the render's."""
     solid_alpha: float = 0.5
     """Coverage from which on a render has a surface; what it covers less is taken to be far away above the horizon."""
     ground_slope: float = 0.05
@@ -100,6 +104,9 @@ class ProjectedPoints:
 OVERLAP_GRID = 24, 16
 """Columns and rows of the places of a view by which it is told how much of it another image shows."""
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
+MOVING_IDS = torch.tensor(palette.DYNAMIC_IDS, dtype=torch.uint8)
+BOX_MARGIN_M = 0.2
+"""Rendered surfaces this far outside an object's box still count as the object."""
 LEAST_FALL = 0.02
 """Metres per metre of depth by which a ray must fall to be followed to the ground."""
 RenderAt = Callable[[View], RenderPlanes]
@@ -134,17 +141,34 @@ class DrawnCloud:
         render = self.render_at(view)
         near = torch.from_numpy(ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1)))
         solid = render.alpha[0] >= self.rules.solid_alpha
+        near &= _among_measured(sparse, depth, self.rules) | ~_another_surface(depth, render, self.rules)
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
         hidden = ~solid & (below_horizon(view, self.rules.ground_slope) | surface_seen) & bool(sparse.valid.any())
-        depth = torch.where(hidden, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m), depth)
+        depth = torch.where(sparse.valid, depth, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m))
         render = replace(render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics))
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
         depth = pick(depth, shown)
         depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
-        return Surfaces(
-            sparse.valid, pick(color, render.color), depth, moving & near, pick(ids, render.semantics[0]), render, vacated
-        )
+        moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
+        return Surfaces(sparse.valid, pick(color, render.color), depth, moving, pick(ids, render.semantics[0]), render, vacated)
+
+    def _in_objects(self, view: View, depth: Tensor, asked: Tensor) -> Tensor:
+        """Which of the `asked` pixels bool[H,W], at `depth` f32[H,W], lie in the box of an object that has a cloud of its own."""
+        found = torch.zeros_like(asked)
+        rows, columns = torch.nonzero(asked, as_tuple=True)
+        if not len(rows):
+            return found
+        rays = torch.stack([axis[rows, columns] for axis in ray_directions(view)], 1).double()
+        places = (rays * depth[rows, columns, None]).numpy() + view.center_world
+        inside_one = np.zeros(len(places), np.bool_)
+        for track in self.tracks:
+            pose = track.pose_at(view.time_s) if track.id in self.cloud.objects else None
+            if pose is not None:
+                own = (places - pose[:3, 3]) @ pose[:3, :3]
+                inside_one |= (np.abs(own) <= 0.5 * track.size_m + BOX_MARGIN_M).all(1)
+        found[rows, columns] = torch.from_numpy(inside_one)
+        return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,11 +187,11 @@ class Surfaces:
     def with_hole(self, color: Tensor, ids: Tensor, found: Tensor) -> tuple[Surfaces, Tensor, Tensor, Tensor]:
         """These surfaces, colours, classes and `found` bool[H,W] of a view after images were warped in to these pixels: what was vacated
         and not found continues what is around it, and does not count as measured; where objects are new the render is all that there is,
-        and counts like a photograph."""
+        and counts like a photograph, as it does where it knows what something hid."""
         if self.vacated is None:
             return self, color, ids, found
         if self.render is not None:
-            shown = self.vacated.shown & (self.render.alpha[0] > 0.5)
+            shown = (self.vacated.shown & (self.render.alpha[0] > 0.5)) | (self.vacated.known(self.render) & ~found)
             color, ids = torch.where(shown, self.render.color, color), torch.where(shown, self.render.semantics[0], ids)
             found = found | shown
         ground = self.measured & torch.isin(self.ids, GROUND_IDS) & torch.isfinite(self.vacated.ground)
@@ -407,6 +431,32 @@ def _filled(
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
     here = (..., *nearest)
     return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
+
+
+def _another_surface(depth: Tensor, render: RenderPlanes, rules: ConditionRules) -> Tensor:
+    """Where a render shows another surface than the one at `depth` f32[H,W], bool[H,W]."""
+    return (render.alpha[0] > rules.sure_alpha) & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
+
+
+def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRules) -> Tensor:
+    """Which pixels are measured, or have measured ones of their filled depth f32[H,W] to both sides in some direction, at most twice
+    `measured_reach_px` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
+    reach = 2 * rules.measured_reach_px
+    own = functional.pad(torch.where(sparse.valid, sparse.depth, torch.inf)[None, None], (reach,) * 4, value=torch.inf)[0, 0]
+    height, width = depth.shape
+
+    def on_side(down: int, right: int) -> Tensor:
+        found = torch.zeros_like(sparse.valid)
+        for step in range(1, reach + 1):
+            top, left = reach + step * down, reach + step * right
+            there = own[top : top + height, left : left + width]
+            found |= (there - depth).abs() <= rules.another_surface * depth
+        return found
+
+    between = sparse.valid.clone()
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        between |= on_side(down, right) & on_side(-down, -right)
+    return between
 
 
 def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Tensor]) -> Tensor:

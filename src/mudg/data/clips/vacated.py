@@ -25,16 +25,30 @@ if TYPE_CHECKING:
 
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
 DYNAMIC = torch.tensor(sorted(palette.DYNAMIC_IDS), dtype=torch.uint8)
+KNOWN_CERTAINTY = 0.5
+"""A render shows what is there where its certainty is at least this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vacated:
-    """Where edits changed a view: pixels bool[H,W] in which something stood that is gone; the depth f32[H,W] in metres of level ground
-    there (NaN above it); and pixels bool[H,W] in which objects are new or stand anew."""
+    """Where edits changed a view.
+
+    Args:
+        mask: pixels bool[H,W] in which something stood that is gone, its shadow included.
+        ground: depth f32[H,W] in metres of level ground there, NaN above it.
+        shown: pixels bool[H,W] in which objects are new or stand anew.
+        stood: pixels bool[H,W] of the mask in which it stood itself.
+    """
 
     mask: Tensor
     ground: Tensor
     shown: Tensor
+    stood: Tensor
+
+    def known(self, render: RenderPlanes | None) -> Tensor:
+        """Pixels bool[H,W] behind what is gone that other photographs determined: the fit knows what is there. Not in its shadow, which
+        a fit knows just as well."""
+        return torch.zeros_like(self.stood) if render is None else self.stood & (render.certainty[0] >= KNOWN_CERTAINTY)
 
 
 VacatedAt = Callable[[View], Vacated]
@@ -78,8 +92,8 @@ def _nearest(ids: Tensor, source: Tensor) -> Tensor:
 
 
 def uncertain_there(render: RenderPlanes, vacated: Vacated, hole: Tensor, color: Tensor) -> RenderPlanes:
-    """A render that claims to know nothing where something stood, and shows in the hole what the condition does."""
-    return replace(
-        render, color=torch.where(hole, color, render.color),
-        certainty=torch.where(vacated.mask, torch.zeros_like(render.certainty), render.certainty),
-    )  # fmt: skip
+    """A render that claims to know nothing where something stood, but for what other photographs determined, and shows in the hole what the
+    condition does."""
+    unknown = vacated.mask & ~vacated.known(render)
+    certainty = torch.where(unknown, torch.zeros_like(render.certainty), render.certainty)
+    return replace(render, color=torch.where(hole, color, render.color), certainty=certainty)

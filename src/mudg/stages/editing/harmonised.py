@@ -4,6 +4,7 @@
    ground about them where recorded photographs of other moments show it brighter: a shadow that stayed.
 2. The model's condition is that of the edited drive (``stages/editing/vacated.py``): points of removed objects are gone, those of moved
    ones moved; photographs do not count where such objects or their shadows were; the renders are those of the edited scene.
+   What the photographs determined behind something that is gone (certainty of the render) stays as rendered.
 3. The sample begins from the edited render. Untouched pixels stay at it at every step; touched ones are free from the noise level on that
    belongs to their kind (``HarmonizeConfig.uncovered``, ``.objects``).
 4. Guard: where the model shows a road user in place of one that was removed, or none where one was put, the render stays.
@@ -29,7 +30,7 @@ from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
 from mudg.data.clips.ablated import ConditionSources
 from mudg.data.clips.condition import ConditionRules
-from mudg.data.clips.vacated import GROUND_IDS
+from mudg.data.clips.vacated import GROUND_IDS, KNOWN_CERTAINTY
 from mudg.models.diffusion import StartClip
 from mudg.models.mdm.codec import Modality
 from mudg.models.scene.model import SceneModel
@@ -216,7 +217,11 @@ class Harmoniser:
 
     def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
         usual, made = draw(view)
-        return made, touched_pixels(self._sources.plan, view, (usual, made), self._config.changed_above)
+        touched = touched_pixels(self._sources.plan, view, (usual, made), self._config.changed_above)
+        if not bool(touched.uncovered.any()):
+            return made, touched
+        sure = render_planes(self._sources.fitted, view).certainty[0] >= KNOWN_CERTAINTY
+        return made, replace(touched, uncovered=touched.uncovered & ~sure)
 
     def _repaired(self, render: Observation, touched: Touched, made: Observation) -> Observation:
         brighter = (made.rgb - render.rgb).mean(0).numpy()

@@ -131,7 +131,8 @@ def vacated_at(plan: EditPlan) -> VacatedAt:
         for pose, size in before:
             depth = _plane_depth(view, pose, size)
             ground = np.where(boxes_mask(view, [(pose, size)]) | ground_mask(view, [(pose, size)]), np.fmin(ground, depth), ground)
-        return Vacated(torch.from_numpy(mask), torch.from_numpy(ground), torch.from_numpy(shown))
+        stood = mask & boxes_mask(view, before)
+        return Vacated(*(torch.from_numpy(plane) for plane in (mask, ground, shown, stood)))
 
     return found
 
