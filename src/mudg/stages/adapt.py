@@ -42,7 +42,7 @@ from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.models import model_of_window
 from mudg.stages.learning.precision import choose_bf16
 
-_OUTPUT = VerbOutput("adapt", 1, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/"))
+_OUTPUT = VerbOutput("adapt", 2, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/"))
 MOST_SCALE = 4
 """Patches are at most this many times finer than the clips."""
 SCORED_STEPS = 2

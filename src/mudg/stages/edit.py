@@ -27,7 +27,7 @@ from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_
 from mudg.stages.fitting.storage import load_model, model_of_scene, save_model
 
 _MODEL = ("model.json", "gaussians.safetensors", "nodes.safetensors")
-_OUTPUT = VerbOutput("edit", 2, (
+_OUTPUT = VerbOutput("edit", 3, (
     "edits.yaml", "edit.json", "lidar.json", *_MODEL, *below("fit/*", _MODEL), *below("scene", (*SCENE_FILES, store.MANIFEST)),
     *below("fuse", ("static.safetensors", "objects/*.safetensors", "fuse.json")),
 ))  # fmt: skip

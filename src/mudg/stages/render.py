@@ -45,7 +45,7 @@ from mudg.stages.radiance.storage import load_field
 
 VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
 """Bytes per pixel that drawing a view needs at least: colour, depth, coverage and shares of the classes."""
-_OUTPUT = VerbOutput("render", 1, ("*.mp4", *below("*", OBSERVATION_FILES)))
+_OUTPUT = VerbOutput("render", 2, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
 def run(

@@ -64,7 +64,7 @@ EDITED_IMAGES_PER_VIEW = 24
 """Recorded images tried per view of an edited drive: what an object hid at one moment others show."""
 COMPUTE = ("offload", "compiled")
 """Settings that say how is computed, not what: a result may be resumed and reused under others."""
-_OUTPUT = VerbOutput("synthesize", 1, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
+_OUTPUT = VerbOutput("synthesize", 2, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
 def run(
