@@ -195,10 +195,10 @@ class Surfaces:
             color, ids = torch.where(shown, self.render.color, color), torch.where(shown, self.render.semantics[0], ids)
             found = found | shown
         ground = self.measured & torch.isin(self.ids, GROUND_IDS) & torch.isfinite(self.vacated.ground)
-        hole = self.vacated.mask & ~found & ~ground  # what stood there may have coloured other points
+        hole = self.vacated.mask & ~found  # what stood there, or its shadow, may have coloured points: of ground, only their place counts
         color, ids = continued(color, ids, self.vacated, hole)
         render = None if self.render is None else uncertain_there(self.render, self.vacated, hole, color)
-        return replace(self, measured=self.measured & ~hole, render=render), color, ids, found
+        return replace(self, measured=self.measured & ~(hole & ~ground), render=render), color, ids, found
 
 
 def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
 DYNAMIC = torch.tensor(sorted(palette.DYNAMIC_IDS), dtype=torch.uint8)
-KNOWN_CERTAINTY = 0.5
-"""A render shows what is there where its certainty is at least this."""
+KNOWN_SHARE = 0.5
+"""A render shows what is there where its certainty is at least this share of the usual one of its view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +48,16 @@ class Vacated:
     def known(self, render: RenderPlanes | None) -> Tensor:
         """Pixels bool[H,W] behind what is gone that other photographs determined: the fit knows what is there. Not in its shadow, which
         a fit knows just as well."""
-        return torch.zeros_like(self.stood) if render is None else self.stood & (render.certainty[0] >= KNOWN_CERTAINTY)
+        return torch.zeros_like(self.stood) if render is None else self.stood & determined(render, ~self.mask)
+
+
+def determined(render: RenderPlanes, usual: Tensor) -> Tensor:
+    """Pixels bool[H,W] that photographs determined about as well as the `usual` ones bool[H,W] of the view, by the median. A longer fit is
+    more certain everywhere, so only the share counts."""
+    covered = (render.alpha[0] > 0.5) & usual
+    if not bool(covered.any()):
+        return torch.zeros_like(covered)
+    return (render.alpha[0] > 0.5) & (render.certainty[0] >= KNOWN_SHARE * render.certainty[0][covered].median())
 
 
 VacatedAt = Callable[[View], Vacated]

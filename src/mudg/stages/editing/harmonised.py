@@ -30,7 +30,7 @@ from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
 from mudg.data.clips.ablated import ConditionSources
 from mudg.data.clips.condition import ConditionRules
-from mudg.data.clips.vacated import GROUND_IDS, KNOWN_CERTAINTY
+from mudg.data.clips.vacated import GROUND_IDS, determined
 from mudg.models.diffusion import StartClip
 from mudg.models.mdm.codec import Modality
 from mudg.models.scene.model import SceneModel
@@ -220,7 +220,7 @@ class Harmoniser:
         touched = touched_pixels(self._sources.plan, view, (usual, made), self._config.changed_above)
         if not bool(touched.uncovered.any()):
             return made, touched
-        sure = render_planes(self._sources.fitted, view).certainty[0] >= KNOWN_CERTAINTY
+        sure = determined(render_planes(self._sources.fitted, view), ~touched.any)
         return made, replace(touched, uncovered=touched.uncovered & ~sure)
 
     def _repaired(self, render: Observation, touched: Touched, made: Observation) -> Observation:
