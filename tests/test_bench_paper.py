@@ -187,7 +187,7 @@ def toy_logs(fids, exact=False):
         logs.append(
             {"log": str(number), "dataset": "city", "cameras": ["front"], "frames": 24, "size": "384x256", "held_out": 6, "tracks": 2,
              "note": "", "exact": exact, "values": values, "made": {}, "films": ["front_shift+2.0"], "columns": ["truth", "gs3d"],
-             "seconds": {"fuse": 1.0, "fit/gs3d": 2.0}}
+             "features": {}, "seconds": {"fuse": 1.0, "fit/gs3d": 2.0}}
         )  # fmt: skip
     return logs
 

@@ -15,7 +15,8 @@ from toy_world import fused_cloud, write_scene
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.base.types import FusedCloud, Observation, Photo
+from mudg.base.renders import RenderPlanes
+from mudg.base.types import FusedCloud, Observation, Photo, PointCloud, View
 from mudg.bench import run as bench
 from mudg.core.edit import Motion
 from mudg.data.clips import vacated as clip_parts
@@ -86,6 +87,49 @@ def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen()
     truth = image_tensor(image_of_wall(view_at(), 12.0))
     assert float((made.color[0] - truth).abs()[:, hole].max()) < 0.35  # smooth, not black
     assert torch.allclose(made.color[0][:, ~hole], truth[:, ~hole], atol=1e-5)
+
+
+@pytest.mark.parametrize("usual", [0.9, 0.3])
+def test_what_photographs_determined_behind_a_removed_object_is_kept(usual: float) -> None:
+    """A red render that is as certain in the left half of what stood there as anywhere in the view, however certain that is, and hardly
+    in the right half."""
+    plan = drive("- remove: {ids: [box]}")
+    vacated = vacated_at(plan)(view_at())
+    columns = torch.nonzero(vacated.stood.any(0))[:, 0]
+    left = vacated.stood & (torch.arange(48) <= int(columns.float().mean()))
+    right = vacated.stood & ~left
+    assert bool(left.any()) and bool(right.any())
+
+    def render(view: View) -> RenderPlanes:
+        one = torch.ones(1, view.camera.height, view.camera.width)
+        certainty = torch.where(right, 0.1 * usual, usual)[None]
+        return RenderPlanes(torch.tensor([1.0, 0, 0]).view(3, 1, 1) * one, 12 * one, one, certainty, (2 * one).to(torch.uint8))
+
+    photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
+    cloud = FusedCloud(wall(12.0, stripes), {})
+    made = build_conditions(cloud, [], [view_at()], photos, RULES, render_at=render, vacated_at=vacated_at(plan))[0]
+    red = (made.color[0] == torch.tensor([1.0, 0, 0]).view(3, 1, 1)).all(0)
+    assert made.renders is not None
+    assert bool(red[left].all()) and bool(made.warped[0, 0][left].all()) and bool((made.renders.certainty[0, 0][left] == usual).all())
+    unknown = vacated.mask & ~left
+    assert not bool(red[unknown].any()) and not bool(made.warped[0, 0][unknown].any())
+    assert bool((made.renders.certainty[0, 0][unknown] == 0).all())
+
+
+def test_ground_that_a_removed_object_darkened_keeps_its_place_but_not_its_colour() -> None:
+    """Road points half a metre below the box; those in its shadow were coloured black."""
+    x, y = np.meshgrid(np.arange(3, 14, 0.03), np.arange(-8, 8, 0.03))
+    xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.5)], 1).astype(np.float32)
+    plan = drive("- remove: {ids: [box]}")
+    dark = (np.abs(xyz[:, 0] - 6) < 0.8) & (np.abs(xyz[:, 1] + 2) < 1)
+    rgb = np.where(dark[:, None], 0, 130).repeat(3, 1).astype(np.uint8)
+    cloud = FusedCloud(PointCloud(xyz, rgb, "world", semantics=np.full(len(xyz), ID["road"], np.uint8)), {})
+    made = build_conditions(cloud, [], [view_at()], [], RULES, vacated_at=vacated_at(plan))[0]
+    plain = build_conditions(cloud, [], [view_at()], [], RULES)[0]
+    black = plain.valid[0, 0] & (plain.color[0].amax(0) < 0.1)
+    assert int(black.sum()) > 10
+    assert bool(made.valid[0, 0][black].all()) and torch.equal(made.depth[0, 0][black], plain.depth[0, 0][black])
+    assert bool(((made.color[0][:, black] - 130 / 255).abs() < 0.05).all())
 
 
 def test_the_published_reference_is_masked_too() -> None:

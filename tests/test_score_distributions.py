@@ -88,6 +88,11 @@ def test_a_log_is_compared_with_its_recorded_frames_off_its_path_too(tmp_path: P
     assert any(
         "weights that are not the published file" in rule and "pytorch-fid" in rule for rule in document["rules"]
     )
+    sets = {(one["trajectory"], one["method"]): one for one in made["sets"]}
+    kept = lambda name: store.read_safetensors(out / "features" / name)["features"]  # noqa: E731
+    of_b = sets["front_shift+2.0", "b"]
+    again = feature_distances.frechet_distance(kept(of_b["made"]), kept(of_b["reference"]))
+    assert shifted["b"] == pytest.approx(again, abs=1e-5)
     text = (out / "metrics.md").read_text()
     assert "FID and KID: 4 views of every method against 4 recorded frames." in text
     assert score_tables.FLOOR in text

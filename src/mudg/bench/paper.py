@@ -20,7 +20,7 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Trajectory
-from mudg.bench import paper_numbers, paper_page, paper_text, shift_page
+from mudg.bench import paper_numbers, paper_page, paper_sets, paper_text, shift_page
 from mudg.bench.chain import REPAIRED, FitChain, at_once, each_log, learns_virtual, made, refuse_foreign, seconds_of
 from mudg.bench.paper_logs import ListedCity, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
 from mudg.bench.paper_tables import RECORDED, TABLES, PaperRow, PaperTable, further_columns
@@ -124,7 +124,8 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
         "continued_share": CONTINUED_SHARE, "videos": config.videos, "score": configuration.result_settings(measured),
         "digests": digests,
     }  # fmt: skip
-    document = paper_numbers.document(table, found, [_values_of(row) for row in rows], settings)
+    together = paper_sets.pooled(found, out)
+    document = paper_numbers.document(table, found, [_values_of(row) for row in rows], settings, together)
     store.write_json(out / "bench.json", document)
     for name, text in (("md", paper_text.markdown), ("csv", paper_text.csv_text), ("tex", paper_text.latex)):
         store.write_text(out / f"bench.{name}", text(document))
@@ -207,20 +208,28 @@ def make_log(job: PaperJob) -> dict[str, Any]:
     names = {place.name: names_at(place.endings(job.log.side), asked.cameras) for place in job.table.places}
     columns = tuple(dict.fromkeys((*job.table.columns, *further_columns(truth is not None))))
     values = {
-        name: {place: paper_numbers.at_place(documents, at, columns) for place, at in names.items()} for name, documents in scored.items()
+        name: {place: paper_numbers.at_place(tuple(documents.values()), at, columns) for place, at in names.items()}
+        for name, documents in scored.items()
     }  # fmt: skip
+    places = {
+        name: {place: paper_sets.files_at(documents, at, job.out.parent) for place, at in names.items()}
+        for name, documents in scored.items()
+    }
+    if truth is None:
+        places[TRUTH] = {place: paper_sets.halves(files) for place, files in places[FILL].items()}
     for name in left_out:
         why = "the model uses no renders" if name == REPAIRED else "no model: --freevs-model"
         values[name] = dict.fromkeys(names, {column.key: {"value": why} for column in columns})
     if truth is None:
-        values[TRUTH] = {place: paper_numbers.floors_at(scored[FILL], at, columns) for place, at in names.items()}
+        values[TRUTH] = {place: paper_numbers.floors_at(tuple(scored[FILL].values()), at, columns) for place, at in names.items()}
     shown = {**({} if truth is None else {TRUTH: truth}), **views}
     # With another method the old pictures are out of date, whatever was asked.
     made(
         lambda o: shift_page.film(shown, asked.paths, job.out / "film", videos=job.videos, overwrite=o), overwrite=True
     )
     return {
-        **facts_of(job.log, read_scene(scene)), "exact": truth is not None, "values": values, "made": paper_numbers.made_of(scored[FILL]),
+        **facts_of(job.log, read_scene(scene)), "exact": truth is not None, "values": values, "features": places,
+        "made": paper_numbers.made_of(tuple(scored[FILL].values())),
         "films": [path.name for path in asked.paths], "columns": list(shown), "seconds": seconds_of(job.out),
     }  # fmt: skip
 
@@ -275,15 +284,15 @@ def _generated(job: PaperJob, settings: SynthesizeConfig, scene: Path, fitted: P
 
 def scores_of(
     job: PaperJob, name: str, folders: Sequence[Path], scene: Path, truth: Path | None
-) -> tuple[Mapping[str, Any], ...]:
-    """What the scorer says of every folder of a row's views; the truth needs no networks that compare view with view."""
+) -> dict[Path, Mapping[str, Any]]:
+    """What the scorer says of every folder of a row's views, by its own folder; the truth needs no networks that compare view with view."""
     settings = replace(job.score, perceptual_views=0, lpips_weights="") if name == TRUTH else job.score
-    found = []
+    found = {}
     for number, folder in enumerate(folders):
         scored = job.out / "score" / (f"{name}-{number}" if number else name)
         made(
             lambda o, f=folder, s=scored: score.run(settings, scene, {name: f}, s, truth=truth, overwrite=o),
             job.overwrite,
         )
-        found.append(store.read_json(scored / "metrics.json"))
-    return tuple(found)
+        found[scored] = store.read_json(scored / "metrics.json")
+    return found

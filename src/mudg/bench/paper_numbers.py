@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
+from types import MappingProxyType
 from typing import Any, Final
 
 from mudg.base.errors import InputError
@@ -91,7 +92,7 @@ def made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for document in documents:
         for entry in dict.fromkeys(SET_METRICS.values()):
             if document.get(entry):
-                found[entry] = {name: value for name, value in document[entry].items() if name != "floors"}
+                found[entry] = {name: value for name, value in document[entry].items() if name not in ("floors", "sets")}
     return found
 
 
@@ -99,13 +100,15 @@ def made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def document(
-    table: PaperTable, logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]
-) -> dict[str, Any]:
+    table: PaperTable, logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], settings: Mapping[str, Any],
+    pooled: Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]] = MappingProxyType({}),
+) -> dict[str, Any]:  # fmt: skip
     """Everything ``bench.json`` holds.
 
     Args:
         logs: per log its facts, ``exact``, ``values[row][place][key]`` as from `at_place`, ``made``, ``films``, ``columns``, seconds.
         rows: name, title, method and changes of what was computed. settings: of the benchmark.
+        pooled: row -> place -> metric -> mean and standard error of the sets of all logs together, where there are such.
 
     Raises:
         InputError: methods have different numbers of views.
@@ -115,8 +118,10 @@ def document(
     main = [(place.name, column) for place, column in table.cells()]
     columns = further_columns(exact)
     further = [(place.name, column) for place in table.places for column in columns]
+    of_sets = lambda row, place, key: pooled.get(row, {}).get(place, {}).get(key)  # noqa: E731
     cells = {
-        row["name"]: {place: {c.key: _cell(logs, row["name"], place, c) for p, c in (*main, *further) if p == place}
+        row["name"]: {place: {c.key: _cell(logs, row["name"], place, c, of_sets(row["name"], place, c.key))
+                              for p, c in (*main, *further) if p == place}
                       for place in dict.fromkeys(p for p, _ in main)}
         for row in every
     }  # fmt: skip
@@ -138,8 +143,10 @@ def document(
     }  # fmt: skip
 
 
-def _cell(logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn) -> dict[str, Any]:
-    """Mean over all logs, or the reason why there is none."""
+def _cell(
+    logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn, pooled: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Mean over all logs, or the value of their ``pooled`` sets; or the reason why there is none."""
     found = [entry["values"][row][place].get(column.key, {"value": NOT_SCORED}) for entry in logs]
     if row == TRUTH and column.key in BY_DEFINITION:
         return {"reason": SELF}
@@ -151,7 +158,7 @@ def _cell(logs: Sequence[Mapping[str, Any]], row: str, place: str, column: Paper
     reference = {"n_reference": [one["n_reference"] for one in found]} if "n_reference" in found[0] else {}
     return {
         "mean": fmean(numbers), "standard_error": standard_error(fmean, numbers), "logs": len(numbers), "n": [one["n"] for one in found],
-        **reference,
+        **reference, **({} if pooled is None else {**pooled, "mean_over_logs": fmean(numbers)}),
     }  # fmt: skip
 
 

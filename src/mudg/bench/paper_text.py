@@ -78,8 +78,9 @@ def _notes_of_sets(made: Mapping[str, Any]) -> list[str]:
     if sets:
         whose = "published weights" if sets["published_weights"] else "weights that are not the published file"
         notes.append(
-            f"FID and KID: per log and path, then the mean; {whose} ({sets['weights_sha256'][:12]}), resize rule {sets['resize']}, "
-            f"covariance with {sets['covariance']}. With so few frames FID is mostly bias: read it beside the truth itself."
+            f"FID, KID and FVD: all logs' views of a place are one set, against all recorded frames of their cameras; "
+            f"{whose} ({sets['weights_sha256'][:12]}), resize rule {sets['resize']}, "
+            f"covariance with {sets['covariance']}. FID of few frames is mostly bias: read it beside the truth itself."
         )  # fmt: skip
     if videos:
         notes.append(

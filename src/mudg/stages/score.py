@@ -58,7 +58,7 @@ FILES: Final = (*LPIPS_FILES, "fid_weights", "fvd_weights", "dino_weights", "cli
 """Settings that name files and folders to read."""
 DEPTH_LIMIT_M: Final = 80.0
 _OUTPUT: Final = VerbOutput(
-    "score", 5,
+    "score", 6,
     ("metrics.json", "metrics.md", "errors/*.png", f"{FEATURES_FOLDER}/*.safetensors",
      *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
 )  # fmt: skip

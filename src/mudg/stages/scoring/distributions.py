@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -125,8 +125,12 @@ class EmbeddingFiles:
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
         """Embeddings f32[n, width], read from the folder if these very pixels were seen before."""
+        return self.named(images)[1]
+
+    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the embeddings ("" of an empty set), and the embeddings f32[n, width]."""
         if not images.count:
-            return np.zeros((0, self.width), np.float32)
+            return "", np.zeros((0, self.width), np.float32)
         return kept_features(self.folder, self.key, images, (images.count, self.width), lambda: self._computed(images))
 
     def _computed(self, images: ImageSet) -> NDArray[np.float32]:
@@ -162,11 +166,16 @@ class FeatureFiles:
         """Features f32[n, 2048] of a set."""
         return self._files.of(images)
 
+    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the features of a set, and the features."""
+        return self._files.named(images)
+
 
 def kept_features(
     folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
-) -> NDArray[np.float32]:
-    """Features of a set, from a folder if these very pixels went through the same network before, else computed and kept there.
+) -> tuple[str, NDArray[np.float32]]:
+    """The name of the file with the features of a set, and the features: from a folder if these very pixels went through the same network
+    before, else computed and kept there.
 
     Args:
         folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute: makes them.
@@ -179,16 +188,27 @@ def kept_features(
     if path.is_file():
         found = store.read_safetensors(path).get("features")
         if found is not None and found.shape == shape:
-            return found
+            return path.name, found
     features = compute()
     store.write_safetensors(path, {"features": features})
-    return features
+    return path.name, features
 
 
 def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
     """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the camera."""
     frames = scene.frames_of(sets.camera) if sets.camera in scene.cameras else ()
     return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
+
+
+@dataclass(frozen=True)
+class FeatureSets:
+    """Which files of features were compared, so that sets of several logs can be pooled: one record per method and trajectory."""
+
+    records: list[dict[str, str]] = field(default_factory=list)
+
+    def note(self, trajectory: str, method: str, made: str, reference: str) -> None:
+        """Note the names of two files in the folder of features."""
+        self.records.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
 
 
 class Distributions:
@@ -200,8 +220,9 @@ class Distributions:
 
     def __init__(self, scene: Scene, features: FeatureFiles) -> None:
         self._scene, self._features = scene, features
-        self._recorded: dict[tuple[str, int, int], NDArray[np.float32]] = {}
+        self._recorded: dict[tuple[str, int, int], tuple[str, NDArray[np.float32]]] = {}
         self._floors: list[dict[str, Any]] = []
+        self._sets = FeatureSets()
 
     def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
         """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
@@ -213,14 +234,16 @@ class Distributions:
         if len(set(counts.values())) > 1:
             raise InputError("FID of sets of different size cannot be compared", where=sets.name, expected="the same views for all methods",
                 got=", ".join(f"{method}: {count}" for method, count in counts.items()))  # fmt: skip
-        reference = self._reference(sets)
+        name, reference = self._reference(sets)
         if not len(reference):
             return dict.fromkeys(counts, score_tables.NO_TRUTH)
         if min(*counts.values(), len(reference)) < FEWEST:
             return dict.fromkeys(counts, score_tables.TOO_FEW)
         found: dict[str, SetDistances | str] = {}
         for method, images in sets.methods.items():
-            found[method] = distances(self._features.of(images.resized(sets.width, sets.height)), reference)
+            own, made = self._features.named(images.resized(sets.width, sets.height))
+            self._sets.note(sets.name, method, own, name)
+            found[method] = distances(made, reference)
         self._note_floor(sets, reference)
         return found
 
@@ -229,13 +252,13 @@ class Distributions:
         return {
             "network": "Inception-v3 of 2015, global average, 2048 values", "weights_sha256": self._features.sha256,
             "published_weights": self._features.source_sha256 == inception.KNOWN_SHA256, "resize": self._features.rule,
-            "reference": "recorded frames of the same camera", "covariance": "n - 1", "floors": self._floors,
+            "reference": "recorded frames of the same camera", "covariance": "n - 1", "floors": self._floors, "sets": self._sets.records,
         }  # fmt: skip
 
-    def _reference(self, sets: TrajectorySets) -> NDArray[np.float32]:
+    def _reference(self, sets: TrajectorySets) -> tuple[str, NDArray[np.float32]]:
         key = (sets.camera, sets.width, sets.height)
         if key not in self._recorded:
-            self._recorded[key] = self._features.of(recorded_images(self._scene, sets))
+            self._recorded[key] = self._features.named(recorded_images(self._scene, sets))
         return self._recorded[key]
 
     def _note_floor(self, sets: TrajectorySets, reference: NDArray[np.float32]) -> None:

@@ -26,6 +26,7 @@ from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring.distributions import (
     FEATURES_FOLDER,
     FEWEST,
+    FeatureSets,
     ImageSet,
     TrajectorySets,
     kept_features,
@@ -55,9 +56,13 @@ class ClipFiles:
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
         """Features f32[clips, 400]; no row if the video is shorter than a clip."""
+        return self.named(images)[1]
+
+    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the features ("" if there is no clip), and the features."""
         count = clip_count(images.count)
         if not count:
-            return np.zeros((0, i3d.WIDTH), np.float32)
+            return "", np.zeros((0, i3d.WIDTH), np.float32)
         key = f"I3D {self.sha256} {self.rule} {CLIP_FRAMES} {HOP_FRAMES}"
         return kept_features(self._folder, key, images, (count, i3d.WIDTH), lambda: self._computed(images))
 
@@ -93,6 +98,7 @@ class VideoDistances:
     def __init__(self, scene: Scene, clips: ClipFiles) -> None:
         self._scene, self._clips = scene, clips
         self._floors: list[dict[str, Any]] = []
+        self._sets = FeatureSets()
 
     def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
         """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for ``record``.
@@ -105,10 +111,12 @@ class VideoDistances:
             return dict.fromkeys(sets.methods, score_tables.NO_TRUTH)
         if min(clip_count(v.count) for v in (*sets.methods.values(), recorded)) < FEWEST:
             return dict.fromkeys(sets.methods, score_tables.TOO_FEW)
-        reference = self._clips.of(recorded)
+        name, reference = self._clips.named(recorded)
         found: dict[str, dict[str, Any] | str] = {}
         for method, images in sets.methods.items():
-            found[method] = compared(self._clips.of(images.resized(sets.width, sets.height)), reference)
+            own, made = self._clips.named(images.resized(sets.width, sets.height))
+            self._sets.note(sets.name, method, own, name)
+            found[method] = compared(made, reference)
         half = len(reference) // 2
         if sets.truth is not None:
             floor = compared(self._clips.of(sets.truth.resized(sets.width, sets.height)), reference)
@@ -126,6 +134,7 @@ class VideoDistances:
             "network": "I3D, Kinetics-400, scores before the softmax, 400 values", "weights_sha256": self._clips.sha256,
             "norm_epsilon": i3d.NORM_EPSILON, "resize": self._clips.rule, "clip_frames": CLIP_FRAMES, "hop_frames": HOP_FRAMES,
             "reference": "recorded video of the same camera", "covariance": "n - 1", "floors": self._floors,
+            "sets": self._sets.records,
         }  # fmt: skip
 
 
