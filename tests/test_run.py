@@ -13,7 +13,10 @@ import pytest
 
 from mudg import cli
 from mudg.base import config as configuration
-from mudg.base import store
+from mudg.base import (
+    store,
+    usage,
+)
 from mudg.base.errors import InputError, IntegrityError, NumericsError, UsageError
 from mudg.report import run_report
 from mudg.stages import adapt, annotate, fit, fuse, ingest, render, run, score, synthesize
@@ -176,7 +179,7 @@ def test_seconds_add_up_over_continuations_and_reuse_adds_none(
 ) -> None:
     clock = {"now": 0.0}
     costs = {"ingest": [10.0, 1.0, 1.0], "fuse": [2.0, 0.5], "synthesize": [30.0, 12.0, 0.25]}
-    monkeypatch.setattr(run.time, "monotonic", lambda: clock["now"])
+    monkeypatch.setattr(usage.time, "monotonic", lambda: clock["now"])
     plain = {name: module.run for name, module in (("ingest", ingest), ("fuse", fuse), ("synthesize", synthesize))}
 
     def costing(name: str) -> Callable[..., Path]:

@@ -269,7 +269,7 @@ def test_seconds_of_an_interrupted_replacement_count(tmp_path: Path) -> None:
     new.pause()
     state = store.read_json(new.path / "run.json")
     store.write_json(new.path / "run.json", {**state, "seconds": 40.0})
-    assert run(folder, 2, overwrite=True).seconds_before() == 40.0
+    assert run(folder, 2, overwrite=True).spent_before().seconds == 40.0
 
 
 def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

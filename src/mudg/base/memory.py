@@ -22,7 +22,7 @@ def free_bytes() -> int:
 
 def machine_bytes() -> int | None:
     """Memory that programs on this machine can still ask for; None where the system does not say."""
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", _text("/proc/meminfo"), re.MULTILINE)
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", system_text("/proc/meminfo"), re.MULTILINE)
     return 1024 * int(found[1]) if found else None
 
 
@@ -58,7 +58,7 @@ def in_words(count: float) -> str:
 
 def _group_bytes() -> int | None:
     for limit, used in (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")):
-        texts = [_text(f"/sys/fs/cgroup/{name}").strip() for name in (limit, used)]
+        texts = [system_text(f"/sys/fs/cgroup/{name}").strip() for name in (limit, used)]
         if all(text.isdigit() for text in texts) and int(texts[0]) < 1 << 60:
             return max(0, int(texts[0]) - int(texts[1]))
     return None
@@ -70,14 +70,15 @@ def _address_bytes() -> int | None:
     import resource
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    pages = _text("/proc/self/statm").split()
+    pages = system_text("/proc/self/statm").split()
     if limit == resource.RLIM_INFINITY or not pages:
         return None
     return max(0, limit - int(pages[0]) * resource.getpagesize())
 
 
-def _text(path: str) -> str:
+def system_text(path: str) -> str:
+    """What the system says in a file of ``/proc`` or ``/sys``; empty where it does not."""
     try:
-        return Path(path).read_text(encoding="ascii")
+        return Path(path).readsystem_text(encoding="ascii")
     except (OSError, UnicodeDecodeError):
         return ""

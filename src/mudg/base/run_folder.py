@@ -14,7 +14,6 @@ import json
 import os
 import re
 import socket
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -26,6 +25,7 @@ from mudg.base.config import differences
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.base.processes import process_alive
 from mudg.base.replacement import Replacement, all_names, remove_files
+from mudg.base.usage import Meter, Usage, folder_bytes
 
 _STATE, _SETTINGS, _LOCK, _LOG = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG
 _BEGUN = frozenset({_STATE, _SETTINGS, _LOCK})
@@ -259,7 +259,8 @@ class RunDir:
         """Whether nothing was in the folder when it was opened."""
         self._output = output
         self._made_folder = path != out or not path.is_dir()
-        self._started_s = time.monotonic()
+        self._meter = Meter()
+        self._earlier: Usage | None = None
 
     @classmethod
     def open(
@@ -331,19 +332,22 @@ class RunDir:
     def _write_state(self, state: str, summary: Mapping[str, Any]) -> None:
         from mudg.base.versions import environment
 
-        seconds = self.seconds_before() + time.monotonic() - self._started_s
+        if state != "running":
+            self._meter.stop()
+        spent = self.spent_before().then(self._meter.usage()).record()
         values = {
             "schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state,
-            "seconds": round(seconds, 3), "files": list(self._output.files), "environment": environment(), "summary": dict(summary),
+            **spent, "written_bytes": folder_bytes(self.path), "files": list(self._output.files), "environment": environment(),
+            "summary": dict(summary),
         }  # fmt: skip
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
 
-    def seconds_before(self) -> float:
-        """Seconds that earlier, interrupted runs of this same key have taken."""
-        if not hasattr(self, "_seconds_before"):
+    def spent_before(self) -> Usage:
+        """What earlier, interrupted runs of this same key have taken."""
+        if self._earlier is None:
             state = run_state(self.path)
-            self._seconds_before = float(state.get("seconds", 0.0)) if state.get("key") == self.key else 0.0
-        return self._seconds_before
+            self._earlier = Usage.of_record(state) if state.get("key") == self.key else Usage()
+        return self._earlier
 
     def log(self, **fields: Any) -> None:
         """Append one JSON line to log.jsonl."""

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from mudg.base import memory
 from mudg.core.pictures import depth_colors
 from mudg.report import html
 from mudg.report.score_tables import (
@@ -340,7 +341,12 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
 def _time_values(ledger: Mapping[str, Any]) -> dict[str, Any]:
     seconds = {name: step["seconds"] for name, step in ledger.get("steps", {}).items()}
     total, longest = sum(seconds.values()) or 1.0, max(seconds.values(), default=1.0) or 1.0
-    steps = [{"name": n, "seconds": s, "share": s / total, "of_longest": s / longest} for n, s in seconds.items()]
+    size = lambda step, name: memory.in_words(step[name]) if step.get(name) else ""  # noqa: E731
+    steps = [
+        {"name": name, "seconds": step["seconds"], "processor_s": step.get("processor_s"), "memory": size(step, "peak_bytes"),
+         "written": size(step, "written_bytes"), "share": step["seconds"] / total, "of_longest": step["seconds"] / longest}
+        for name, step in ledger.get("steps", {}).items()
+    ]  # fmt: skip
     return {"steps": steps, "total_time": _duration(total)}
 
 

@@ -6,7 +6,6 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,9 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError
+from mudg.base.memory import in_words
 from mudg.base.run_folder import is_temporary, refuse_overlap
+from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
 from mudg.stages.config import FitConfig, RunConfig, with_device
 from mudg.stages.config.presets import NO_MODEL
@@ -281,10 +282,14 @@ def _digests(out: Path) -> dict[str, str]:
 def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     from mudg.stages import score
 
-    rows = "\n".join(f"  {name:<26}{seconds:8.1f} s" for name, seconds in ledger.seconds().items())
+    rows = "\n".join(
+        f"  {name:<26}{seconds:8.1f} s{processor_s:11.1f} s{in_words(peak) if peak else '':>12}{in_words(size):>12}"
+        for name, (seconds, processor_s, peak, size) in ledger.rows().items()
+    )
     total = sum(ledger.seconds().values())
     return (
-        f"{score.summary_table(out / 'score')}\n\nseconds per step\n{rows}\n  {'total':<26}{total:8.1f} s\n\n"
+        f"{score.summary_table(out / 'score')}\n\n  {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}\n{rows}\n"
+        f"  {'total':<26}{total:8.1f} s\n\n"
         f"report: {report.resolve()}"
     )
 
@@ -356,25 +361,30 @@ class _Ledger:
     def timed(self, step: Step) -> Any:
         """Do one step and add its seconds, also when it is interrupted; a reused result adds none."""
         finished = self._steps.get(step.name, {}).get("state") == "complete" and (self._out / step.folder).exists()
-        began = time.monotonic()
-        state = "interrupted"
+        meter, state = Meter(), "interrupted"
         log.info(f"== {step.name}")
         try:
             path = step.make()
             state = "complete"
         finally:
-            spent = time.monotonic() - began
-            earlier = float(self._steps.get(step.name, {}).get("seconds", 0.0))
-            if not (finished and state == "complete" and spent < earlier):
-                self._steps[step.name] = {
-                    "state": state, "seconds": round(earlier + spent, 2) if not finished else round(spent, 2),
-                }  # fmt: skip
+            spent, known = meter.stop(), self._steps.get(step.name, {})
+            earlier = Usage.of_record(known)
+            if not (finished and state == "complete" and spent.seconds < earlier.seconds):
+                spent = spent if finished else earlier.then(spent)
+                self._steps[step.name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(self._out / step.folder)}
             self.save("running")
         return path
 
     def seconds(self) -> dict[str, float]:
         """Seconds per step, in order."""
         return {name: float(entry["seconds"]) for name, entry in self._steps.items()}
+
+    def rows(self) -> dict[str, tuple[float, float, int | None, int]]:
+        """Seconds, processor seconds, most memory and bytes written per step, in order."""
+        spent = {name: Usage.of_record(entry) for name, entry in self._steps.items()}
+        return {
+            name: (of.seconds, of.processor_s, of.peak_bytes, int(self._steps[name].get("written_bytes", 0))) for name, of in spent.items()
+        }
 
     def save(self, state: str) -> None:
         """Write OUT/run.json."""

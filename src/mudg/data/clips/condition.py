@@ -39,7 +39,7 @@ from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import seen_pixels
-from mudg.data.clips.vacated import Vacated, VacatedAt, continued, ground_behind, uncertain_there
+from mudg.data.clips.vacated import Vacated, VacatedAt, continued, determined, ground_behind, uncertain_there
 
 
 @dataclass(frozen=True, slots=True)
@@ -434,8 +434,9 @@ def _filled(
 
 
 def _another_surface(depth: Tensor, render: RenderPlanes, rules: ConditionRules) -> Tensor:
-    """Where a render shows another surface than the one at `depth` f32[H,W], bool[H,W]."""
-    return (render.alpha[0] > rules.sure_alpha) & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
+    """Where a render shows another surface than the one at `depth` f32[H,W], and photographs determined it, bool[H,W]."""
+    sure = (render.alpha[0] > rules.sure_alpha) & determined(render, torch.ones_like(depth, dtype=torch.bool))
+    return sure & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
 
 
 def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRules) -> Tensor:
