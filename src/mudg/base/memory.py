@@ -79,6 +79,6 @@ def _address_bytes() -> int | None:
 def system_text(path: str) -> str:
     """What the system says in a file of ``/proc`` or ``/sys``; empty where it does not."""
     try:
-        return Path(path).readsystem_text(encoding="ascii")
+        return Path(path).read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError):
         return ""
