@@ -159,6 +159,12 @@ def _page(args: f.PageFlags) -> dict[str, Any]:
     return view.run_page(args.settings, args.run, args.out, scene=args.scene, compare=args.compare, overwrite=args.overwrite)
 
 
+def _report(args: f.ReportFlags) -> dict[str, Any]:
+    from mudg.stages.viewing import gallery
+
+    return gallery.run(args.runs, args.out, overwrite=args.overwrite)
+
+
 def _view(args: f.ViewFlags) -> dict[str, Any]:
     from mudg.stages.viewing import view
 
@@ -327,6 +333,11 @@ VERBS: dict[str, Verb] = {
         ("mudg view runs/kitti", "mudg view runs/a runs/b", "mudg view runs/mudg_s --scene scenes/city --port 8080"),
         _view,
     ),
+    "report": Verb(
+        "Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter.",
+        ("mudg report runs/kitti runs/city --out runs.html", "mudg report runs --out runs.html"),
+        _report,
+    ),
     "score": Verb(
         "Compare views with ground truth: metrics, tables, error images.",
         ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",),
@@ -346,7 +357,7 @@ VERBS: dict[str, Verb] = {
 SECTIONS = (
     ("start here", ("demo", "run", "doctor")),
     ("single steps, in the order of use", ("ingest", "annotate", "fuse", "learn", "fit", "adapt", "synthesize", "render", "score")),
-    ("look at a drive", ("view", "page")),
+    ("look at a drive", ("view", "page", "report")),
     ("change a drive", ("edit", "asset")),
     ("other programs", ("export",)),
     ("benchmarks", ("bench",)),

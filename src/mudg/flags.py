@@ -257,6 +257,18 @@ class PageFlags(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReportFlags(Common):
+    """Flags of ``mudg report``."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="RUN [RUN ...]")]
+    """Folders of mudg run, score or bench; of any other folder, the folders in it."""
+    out: Annotated[Path, arg(metavar="FILE.html")]
+    """Page to write."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace the page if it exists."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewFlags(Common):
     """Flags of ``mudg view``."""
 
@@ -359,7 +371,7 @@ class Doctor(Common):
 FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
     "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
-    "edit": EditFlags, "asset": AssetFlags, "export": ExportFlags, "page": PageFlags, "view": ViewFlags,
+    "edit": EditFlags, "asset": AssetFlags, "export": ExportFlags, "page": PageFlags, "view": ViewFlags, "report": ReportFlags,
 }  # fmt: skip
 
 

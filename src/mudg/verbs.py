@@ -150,6 +150,13 @@ def page(
     return stage.run_page(made, Path(run), Path(out), scene=_optional(scene), compare=_optional(compare), overwrite=overwrite)["page"]
 
 
+def report(runs: Sequence[Location], out: Location, *, overwrite: bool = False) -> Path:
+    """Write one page over finished folders of ``run``, ``score`` or ``bench``; returns the page."""
+    from mudg.stages.viewing import gallery as stage
+
+    return stage.run([Path(run) for run in runs], Path(out), overwrite=overwrite)["page"]
+
+
 def edit(
     source: Location, script: Location, out: Location, *,
     scene: Location | None = None, fused: Location | None = None, overwrite: bool = False,

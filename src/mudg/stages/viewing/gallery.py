@@ -1,0 +1,60 @@
+"""``mudg report``: one page over many finished runs. A run that cannot be read is listed with its reason; the others go on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.report.gallery import GalleryEntry, Unread, page, read_shown
+
+
+def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+    """Write the page of finished runs, scores and benchmarks.
+
+    Args:
+        runs: folders of ``mudg run``, ``mudg score`` or ``mudg bench``; of any other folder, those directly in it.
+        out: the file to write. overwrite: replace it if it exists.
+
+    Returns:
+        ``page``: the file; ``shown``: how many folders are on it; ``text``.
+
+    Raises:
+        UsageError: the output exists or is no HTML file. InputError: nothing can be shown.
+    """
+    out = Path(out)
+    if out.suffix != ".html":
+        raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
+    if out.exists() and not overwrite:
+        raise UsageError("the output exists", where=str(out), remedy="choose another --out, or add --overwrite")
+    shown: list[GalleryEntry] = []
+    unread: list[Unread] = []
+    for folder in _folders(runs):
+        try:
+            shown.append(read_shown(folder))
+        except InputError as error:
+            log.warn(f"{folder}: {error.what}")
+            unread.append(Unread(folder, error.what if not error.got else f"{error.what}: {error.got}"))
+    if not shown:
+        raise InputError(
+            "no finished run to show", where=", ".join(str(one.folder) for one in unread[:4]),
+            got="; ".join(dict.fromkeys(one.reason for one in unread[:4])), expected="folders of mudg run, score or bench",
+        )  # fmt: skip
+    content = page(shown, unread, out.resolve()).encode()
+    store.atomic_write(out, content)
+    left = f", {len(unread)} not shown" if unread else ""
+    text = f"page: {out.resolve()} ({len(shown)} runs{left}, {len(content) / 1e6:.1f} MB)"
+    return {"page": out, "shown": len(shown), "text": text}
+
+
+def _folders(runs: Sequence[Path]) -> list[Path]:
+    """The folders asked for, each once; a folder that is no run stands for the folders in it."""
+    found: list[Path] = []
+    for given in map(Path, runs):
+        own = any((given / name).is_file() for name in (store.RUN_STATE, "bench.json"))
+        below = [] if own or not given.is_dir() else sorted(given.iterdir())
+        inside = [one for one in below if one.is_dir() and not one.name.startswith(".")]
+        found += [one for one in (inside or [given]) if one.resolve() not in {known.resolve() for known in found}]
+    return found
