@@ -16,10 +16,11 @@ from mudg.data.clips import from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import HELD_OUT
 from mudg.data.clips.from_log import LogClipRules, LogSource
-from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
+from mudg.data.scene import SceneWriter, photographs, read_image, read_label, read_points, read_scene
 from mudg.models.mdm.model import MDM
 from mudg.stages import fuse, learn
-from mudg.stages.config import FuseConfig
+from mudg.stages.adapting import lessons
+from mudg.stages.config import AdaptConfig, FuseConfig
 from mudg.stages.learning import models as learn_models
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
@@ -75,6 +76,18 @@ def test_windows_to_score_share_no_moment_with_those_to_train_on(log):
         from_log.log_windows(scene, LogClipRules(48, 24, window=30))
     with pytest.raises(InputError, match="too short to hold out"):
         from_log.plan_shards([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
+
+
+def test_images_that_an_edit_rendered_in_part_are_no_photographs(log):
+    scene = read_scene(log[1].scene)
+    one = next(f for f in scene.frames if f.id == "front/000006")
+    edited = replace(one, labels={**one.labels, "rendered": next(iter(one.labels.values()))})
+    changed = replace(scene, frames=tuple(edited if f is one else f for f in scene.frames))
+    assert {f.id for f in scene.frames_in("train")} - {f.id for f in photographs(changed)} == {"front/000006"}
+    assert all("front/000006" not in w.frames for w in from_log.log_windows(changed, RULES))
+    assert any("front/000006" in w.frames for w in from_log.log_windows(scene, RULES))
+    names = lambda of: {f.id for block in lessons.blocks_of(of, AdaptConfig()) for f in block}  # noqa: E731
+    assert names(scene) - names(changed) == {"front/000006"}
 
 
 def test_truth_is_what_was_recorded(measured):

@@ -43,7 +43,7 @@ from mudg.data.clips.condition import (
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
-from mudg.data.scene import read_image, read_label, read_points, read_scene, read_trusted_classes
+from mudg.data.scene import photographs, read_image, read_label, read_points, read_scene, read_trusted_classes
 
 INDEX = "log_clips.json"
 SKY = palette.ID["sky"]
@@ -115,12 +115,13 @@ def log_source(text: str) -> LogSource:
 
 
 def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
-    """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene are passed over.
+    """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene, and images that are rendered in part
+    (of an edited drive), are passed over.
 
     Raises:
         InputError: unknown camera, or no camera has enough frames.
     """
-    usable = {frame.id for frame in scene.frames_in("train")}
+    usable = {frame.id for frame in photographs(scene)}
     reach = (rules.window - 1) * rules.frame_step + 1
     found: list[LogWindow] = []
     for camera in rules.cameras or tuple(scene.cameras):
@@ -143,7 +144,7 @@ class OpenLog:
 
     def __init__(self, source: LogSource, rules: LogClipRules) -> None:
         self.scene, self.cloud, self.rules = read_scene(source.scene), read_fused(source.fused), rules
-        self._frames = sorted(self.scene.frames_in("train"), key=lambda f: f.view.time_s)
+        self._frames = sorted(photographs(self.scene), key=lambda f: f.view.time_s)
         self.place = {frame.id: number for number, frame in enumerate(self._frames)}
         times = np.array([f.view.time_s for f in self._frames])
         apart = np.diff(times) > ConditionRules(1, 1).same_time_s

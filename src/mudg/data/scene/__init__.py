@@ -15,7 +15,7 @@ not at all. The same tree as one stored zip is the portable form: ``write_zip`` 
 from __future__ import annotations
 
 from mudg.data.scene.check import Finding, check_scene
-from mudg.data.scene.labels import read_label, read_trusted_classes
+from mudg.data.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.data.scene.point_classes import ImagePointClasses, image_point_classes
 from mudg.data.scene.read import decode_image, read_image, read_points, read_scene
 from mudg.data.scene.write import SCENE_FILES, SceneWriter, write_zip
@@ -28,6 +28,7 @@ __all__ = [
     "check_scene",
     "decode_image",
     "image_point_classes",
+    "photographs",
     "read_image",
     "read_label",
     "read_points",

@@ -49,6 +49,11 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
     return _decode_label(name, open_files(scene.root).read(ref.path), f"{scene.root}: {ref.path}", frame.view.camera)
 
 
+def photographs(scene: Scene) -> tuple[Frame, ...]:
+    """Frames to learn from whose images a camera recorded whole: not held out, and without pixels that an edit of the drive rendered."""
+    return tuple(frame for frame in scene.frames_in("train") if "rendered" not in frame.labels)
+
+
 def read_trusted_classes(scene: Scene, frame: Frame, least: float) -> NDArray[np.uint8] | None:
     """Class ids u8[H, W] of a frame, 255 where unlabelled or where their confidence is below ``least``; None without labels."""
     if "semantics" not in frame.labels:

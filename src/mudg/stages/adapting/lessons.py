@@ -26,7 +26,7 @@ from mudg.base.types import Frame, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.data.clips.condition import ConditionRules, WarpSource, image_tensor, warp
-from mudg.data.scene import read_image, read_points, read_scene, read_trusted_classes
+from mudg.data.scene import photographs, read_image, read_points, read_scene, read_trusted_classes
 from mudg.data.scene.photos import write_photos
 from mudg.models.scene.model import SceneModel
 from mudg.stages import fit, fuse
@@ -72,9 +72,9 @@ def cameras_of(scene: Scene, config: AdaptConfig) -> tuple[str, ...]:
 
 
 def blocks_of(scene: Scene, config: AdaptConfig) -> list[list[Frame]]:
-    """The frames that may be used, in blocks of `config.block` consecutive moments; all cameras of a moment lie in one block."""
+    """The photographs that may be used, in blocks of `config.block` consecutive moments; all cameras of a moment lie in one block."""
     names = set(cameras_of(scene, config))
-    frames = sorted((f for f in scene.frames_in("train") if f.view.camera.name in names), key=lambda f: f.view.time_s)
+    frames = sorted((f for f in photographs(scene) if f.view.camera.name in names), key=lambda f: f.view.time_s)
     moment, last_s, blocks = -1, -np.inf, []
     for frame in frames:
         if frame.view.time_s - last_s > ConditionRules(1, 1).same_time_s:
