@@ -66,6 +66,14 @@ def test_the_thread_ends_with_the_last_meter() -> None:
     assert usage._SAMPLER._thread is None
 
 
+def test_sizes_are_those_of_a_folder_or_of_one_file(tmp_path: Path) -> None:
+    for name, size in (("a/b.txt", 300), ("a/c/d.txt", 40)):
+        store.write_text(tmp_path / name, "x" * size)
+    assert usage.folder_bytes(tmp_path) == 340
+    assert usage.folder_bytes(tmp_path / "a" / "b.txt") == 300
+    assert usage.folder_bytes(tmp_path / "missing") == 0
+
+
 def test_later_parts_add_up_and_the_peak_is_the_highest() -> None:
     assert Usage(1.0, 2.0, 30).then(Usage(4.0, 5.0, 20)) == Usage(5.0, 7.0, 30)
     assert Usage(1.0, 2.0, None).then(Usage(1.0, 1.0, 7)).peak_bytes == 7

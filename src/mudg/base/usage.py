@@ -130,7 +130,10 @@ def resident_bytes() -> int | None:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Size of all files in a folder."""
+    """Size of all files in a folder, or of one file."""
+    with contextlib.suppress(OSError):
+        if folder.is_file():
+            return folder.stat().st_size
     total = 0
     for top, _, names in os.walk(folder):
         for name in names:
