@@ -206,6 +206,25 @@ def _demo(args: f.Demo) -> dict[str, Any]:
     return run.run_chain(args.settings, "city", args.out, overwrite=args.overwrite)
 
 
+def _batch(args: f.BatchFlags) -> dict[str, Any]:
+    from mudg.stages import batch
+
+    place = args.place or args.out
+    if not place or (args.place and args.out):
+        raise UsageError("give one output", expected="mudg batch run --list FILE --out OUT, or mudg batch status OUT", got=place)
+    if args.action == "run":
+        if not args.list:
+            raise UsageError("no list was given", expected="--list FILE, with one source per line")
+        settings = batch.settings_of(args.preset, args.config, args.set)
+        asked = batch.BatchRequest(args.list, place, args.batch, settings, tuple(sys.argv[1:]), args.wait)
+        return batch.run(asked, args.dry_run)
+    if args.action == "status":
+        return batch.watch_status(place, args.html, args.watch_s)
+    if args.action == "cost":
+        return batch.show_cost(place, args.batch.price, args.batch.storage_price)
+    return batch.retry(place, args.reason)
+
+
 def _doctor(args: f.Doctor) -> dict[str, Any]:
     from mudg.stages import doctor
 
@@ -344,6 +363,14 @@ VERBS: dict[str, Verb] = {
         _score,
         "smaller views (--width-px), fewer --views",
     ),
+    "batch": Verb(
+        "Process long lists of logs, on this machine, Slurm, Ray or any scheduler; show progress, failures and costs.",
+        ("mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
+         "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine slurm --shards 500 --config recipe.yaml",
+         "mudg batch status runs --html", "mudg batch retry runs --reason 5,137", "mudg batch cost runs --price 0.04"),
+        _batch,
+        "fewer --jobs, or smaller images (--set ingest.resolution=960)",
+    ),
     "bench": Verb(
         "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.",
         ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
@@ -360,6 +387,7 @@ SECTIONS = (
     ("look at a drive", ("view", "page", "report")),
     ("change a drive", ("edit", "asset")),
     ("other programs", ("export",)),
+    ("many drives", ("batch",)),
     ("benchmarks", ("bench",)),
     ("published models", ("convert",)),
 )
@@ -386,7 +414,7 @@ def overview() -> str:
         "Settings: flags override --config FILE.yaml, which overrides the defaults. Every result holds its settings in run.yaml.",
         "Repeat a command to resume it: finished results are verified and reused, interrupted ones are continued.",
         "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130 interrupted;",
-        "with --list: 10 + number of failed scenes (99: 89 or more).",
+        "with --list, and of batch: 10 + number of failed scenes (99: 89 or more); 143 stopped by SIGTERM.",
     ]
     return "\n".join(lines)
 
@@ -409,6 +437,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         log.set_quiet(args.quiet)
         if words[0] not in ("doctor", "fuse"):  # they do without torch
             memory.require_address_space(f"mudg {words[0]}")
+        if os.environ.get("MUDG_LIFE_LINE"):
+            from mudg.base import processes
+
+            processes.hold_life_line()
         with _sigterm_interrupts():
             result = VERBS[words[0]].call(args)
         code = int(result.pop("exit_code", 0))

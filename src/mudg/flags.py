@@ -60,8 +60,8 @@ class Many(Common):
     """Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to
     OUT/NAME. The exit code is 0, or 10 + the number of failures."""
     shard: Annotated[str, arg(metavar="i/n")] = ""
-    """With --list: process every n-th entry, starting with entry i; i counts from 0 to n-1. Use it to split a list over
-    machines."""
+    """With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it
+    to split a list over machines."""
     jobs: Annotated[int, arg(metavar="INT")] = 0
     """With --list: number of scenes processed at the same time (0 = one per processor)."""
 
@@ -361,6 +361,36 @@ class Bench(Output):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BatchFlags(Common):
+    """Flags of ``mudg batch``."""
+
+    action: Annotated[Literal["run", "status", "retry", "cost"], tyro.conf.Positional, arg(metavar="run|status|retry|cost")]
+    """What to do. run: process a list, or go on with it. status: how far it is. retry: forget failures, so that run tries them again.
+    cost: core-hours, bytes and money."""
+    place: Annotated[str, tyro.conf.Positional, arg(metavar="[OUT]")] = ""
+    """status, retry, cost: folder or address of a batch."""
+    out: Annotated[str, arg(metavar="FOLDER|URL")] = ""
+    """run: folder, or address in an object store (s3://bucket/runs), for results and records."""
+    list: Annotated[str, arg(metavar="FILE|URL")] = ""
+    """run: file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Sources may be addresses."""
+    preset: stage_config.PresetName = "default"
+    """run: settings of the steps to start from, as for mudg run. --config is a file of mudg run, too."""
+    set: Annotated[tuple[str, ...], arg(metavar="STEP.NAME=VALUE")] = ()
+    """run: settings of the steps, over those of --config, as fit.iterations=500 device=cpu."""
+    dry_run: FlagCreatePairsOff[bool] = False
+    """run: only say what there is to do."""
+    wait: FlagCreatePairsOff[bool] = False
+    """run: with --engine slurm, wait for the end of the job."""
+    reason: str = ""
+    """retry: only these exit codes or reasons, with commas, e.g. 5,137 or quality (empty = all)."""
+    html: FlagCreatePairsOff[bool] = False
+    """status: also write OUT/status.html, with figures of the logs."""
+    watch_s: float = 0.0
+    """status: show it again every so many seconds, until nothing is left (0 = once)."""
+    batch: Annotated[stage_config.BatchConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Flags of ``mudg doctor``."""
 
@@ -372,6 +402,7 @@ FLAGS: dict[str, type[Common]] = {
     "demo": Demo, "run": Run, "doctor": Doctor, "ingest": Ingest, "annotate": Annotate, "fuse": Fuse, "learn": Learn,
     "convert": Convert, "adapt": Adapt, "synthesize": Synthesize, "fit": Fit, "render": RenderFlags, "score": Score, "bench": Bench,
     "edit": EditFlags, "asset": AssetFlags, "export": ExportFlags, "page": PageFlags, "view": ViewFlags, "report": ReportFlags,
+    "batch": BatchFlags,
 }  # fmt: skip
 
 

@@ -99,5 +99,5 @@ def test_help_lists_only_what_exists() -> None:
     overview = cli.overview()
     for name in cli.VERBS:
         assert f"\n  {name}" in overview
-    for later in ("batch",):
+    for later in ("cluster",):
         assert f"\n  {later}" not in overview

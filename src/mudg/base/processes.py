@@ -8,6 +8,7 @@
     one_torch_thread    results that do not depend on how many cores are free
     child_environment   threads of processes that are started meanwhile
     process_alive       whether a process still runs
+    life_line           commands that end with the process that started them
 
 Children are spawned, never forked. What parent and child tell each other beside arguments and results is JSON text.
 """
@@ -232,6 +233,11 @@ def _prepare_child() -> None:
 
     log.set_quiet(True)
     torch.set_num_threads(1)
+    end_with_parent()
+
+
+def end_with_parent() -> None:
+    """End this spawned process when its parent is gone."""
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
@@ -240,6 +246,35 @@ def _exit_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
+        os._exit(1)
+
+
+LIFE_LINE = "MUDG_LIFE_LINE"
+"""Environment variable: number of a file that ends when the process that started this one is gone."""
+
+
+@contextlib.contextmanager
+def life_line() -> Iterator[int]:
+    """A file number to be handed to a command (in ``LIFE_LINE``, and kept open there): it ends when this process does."""
+    theirs, ours = os.pipe()
+    try:
+        yield theirs
+    finally:
+        os.close(theirs)
+        os.close(ours)
+
+
+def hold_life_line() -> None:
+    """End this process when the one that started it, and gave it a life line, is gone."""
+    number = os.environ.pop(LIFE_LINE, "")
+    if number.isdecimal():
+        threading.Thread(target=_exit_at_end_of, args=(int(number),), name="life line", daemon=True).start()
+
+
+def _exit_at_end_of(number: int) -> None:
+    with contextlib.suppress(OSError):
+        while os.read(number, 64):
+            pass
         os._exit(1)
 
 

@@ -11,7 +11,6 @@ stopped.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +31,8 @@ from mudg.models.labels.ground import driven_path
 from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
-from mudg.stages import batch
+from mudg.stages.batches import lists
+from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
@@ -90,16 +90,9 @@ def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = Fal
 def run_many(
     config: AnnotateConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
 ) -> dict[str, Any]:
-    """``run`` for every scene of a list; see ``stages/batch.py``."""
-    entries = batch.shard(batch.read_list(listed), shard)
-    work = functools.partial(_one_of_many, dataclasses.replace(config, processes=1))
-    return batch.run_batch(
-        "annotate", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed
-    )
-
-
-def _one_of_many(config: AnnotateConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
-    return run(config, Path(entry.source), out, overwrite=overwrite)
+    """``run`` for every scene of a list; see ``stages/batches/listed.py``."""
+    entries = lists.read_list(listed)
+    return run_listed(ListedRun("annotate", dataclasses.replace(config, processes=1), entries, out, jobs, overwrite, shard, listed))
 
 
 def inputs_of(config: AnnotateConfig, scene: Path) -> dict[str, str]:

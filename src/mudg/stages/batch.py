@@ -1,331 +1,227 @@
-"""One verb over many scenes: ``mudg ingest|annotate|fuse --list FILE --out ROOT [--shard i/n] [--jobs N]``.
+"""``mudg batch run|status|retry|cost``: steps over long lists of driving logs, on any number of workers.
 
-Every scene is a process of its own and writes the folder ROOT/<name>. A finished one is verified and reused, so the same
-command can be repeated until nothing fails; one that fails is reported with its reason, and the others go on.
+The machinery is in ``stages/batches/``; what it promises, and how to use it, in docs/batch.md.
 """
 
 from __future__ import annotations
 
-import io
-import json
-import multiprocessing
 import os
 import re
-import shlex
-import signal
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from multiprocessing.connection import Connection, wait
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from mudg import native
-from mudg.base import failures, log, processes, store
+from mudg.base import config as configuration
+from mudg.base import log
 from mudg.base.errors import InputError, UsageError
+from mudg.base.location import Location
+from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import refuse_overlaps
-from mudg.data.scene.schema import NAME_PATTERN
+from mudg.stages.batches import costs, engines, quality, retries, status
+from mudg.stages.batches.folders import BatchFolder
+from mudg.stages.batches.listed import FAILED_BASE, FAILED_MOST
+from mudg.stages.batches.lists import CITY, Entry, read_list, shard_of
+from mudg.stages.batches.local import WorkersEnd, run_workers
+from mudg.stages.batches.plan import COMMAND, OF_A_LINE, REVISION, BatchPlan, plan_of
+from mudg.stages.batches.work import ASKED_TO_STOP, WorkRequest, WorkRules
+from mudg.stages.config import RunConfig
+from mudg.stages.config.batch import BatchConfig
+from mudg.stages.config.presets import PresetName, run_preset
 
-FAILED_BASE: Final = 10
-"""Exit code of n failed scenes: this plus n, at most ``FAILED_MOST``; apart from all codes with a meaning of their own."""
-FAILED_MOST: Final = 99
-_STATUS_FILE: Final = re.compile(r"status(-\d+-of-\d+)?\.json")
-
-Work = Callable[["Entry", Path, bool], Path]
-"""(entry, output folder, overwrite) -> the folder; a function of a module, since it is called in another process."""
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One line of a list: the source, the name of its output folder, and settings of its own (``sequence``, ``frames``, ...)."""
-
-    name: str
-    source: str
-    settings: Mapping[str, str] = field(default_factory=dict)
+_LIMIT: Final = re.compile(r"\d+(\.\d+)?%?")
+_PATHS: Final = ("poses", "boxes")
+"""Settings of a line that are paths."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a scene: ``done``, ``reused`` or ``failed``, with one line of what it holds or why it failed."""
-
-    name: str
-    source: str
-    state: str
-    seconds: float
-    words: str
-    error: str = ""
-
-
-# --- the list -----------------------------------------------------------------------------------------------------------
-
-
-def read_list(path: Path, settings: Sequence[str] = ()) -> list[Entry]:
-    """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
-
-    A line is ``SOURCE [name=NAME] [setting=value ...]``, quoted as in a shell; ``#`` starts a comment. Relative sources count
-    from the list's folder. Without a name, the last part of the source is taken.
+@dataclass(frozen=True)
+class BatchRequest:
+    """What ``mudg batch run`` is asked for.
 
     Args:
-        settings: settings a line may give.
-
-    Raises:
-        InputError: missing, empty, malformed, or two lines that would write one folder.
+        listed: path or address of the list. out: path or address of the results. batch: how work is shared out. run: settings of the
+            steps. words: the command line behind ``mudg``, for engines that start it elsewhere. wait: for the end of an array job.
     """
-    if path.is_dir():
-        lines = [
-            (str(entry), shlex.quote(entry.name))
-            for entry in sorted(path.iterdir())
-            if not entry.name.startswith(".") and not _STATUS_FILE.fullmatch(entry.name)
-        ]
-        folder = path
-    else:
-        text = store.read_bytes(path).decode("utf-8", "replace")
-        lines = [(f"{path}: line {index + 1}", line) for index, line in enumerate(text.splitlines())]
-        folder = path.parent
-    entries = [entry for where, line in lines if (entry := _entry(line, where, folder, settings)) is not None]
-    if not entries:
-        raise InputError("the list is empty", where=str(path), expected="one source per line")
-    sources: dict[str, str] = {}
-    for entry in entries:
-        if entry.name in sources:
-            raise InputError(
-                "two entries would write the same folder", where=str(path), got=f"{sources[entry.name]} and {entry.source}",
-                remedy=f"give one of them another name: SOURCE name={entry.name}-2",
-            )  # fmt: skip
-        sources[entry.name] = entry.source
-    return entries
+
+    listed: str
+    out: str
+    batch: BatchConfig
+    run: RunConfig
+    words: tuple[str, ...] = ()
+    wait: bool = False
 
 
-def _entry(line: str, where: str, folder: Path, settings: Sequence[str]) -> Entry | None:
-    try:
-        words = shlex.split(line, comments=True)
-    except ValueError as error:
-        raise InputError("cannot parse the line", where=where, got=line[:80]) from error
-    if not words:
-        return None
-    given: dict[str, str] = {}
-    for word in words[1:]:
-        key, separator, value = word.partition("=")
-        if not separator or key not in ("name", *settings):
-            raise InputError(
-                "unknown setting in the line", where=where, got=word[:80],
-                expected=", ".join(f"{key}=..." for key in ("name", *settings)),
-                remedy="put quotes around a path with spaces")  # fmt: skip
-        given[key] = value
-    source = words[0] if words[0] == "city" else str(folder / Path(words[0]).expanduser())
-    name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
-    if not NAME_PATTERN.fullmatch(name):
-        raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
-    return Entry(name, source, given)
-
-
-def shard(entries: list[Entry], text: str) -> list[Entry]:
-    """Every n-th entry from the i-th on, for ``"i/n"`` with i from 0 to n - 1; an empty text takes all.
-
-    Raises:
-        UsageError: not of this form.
-    """
-    if not text:
-        return entries
-    first, separator, count = text.partition("/")
-    if not separator or not first.isdigit() or not count.isdigit() or not int(first) < int(count):
-        raise UsageError(
-            "invalid shard", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4", got=text
-        )
-    return entries[int(first) :: int(count)]
-
-
-# --- running ------------------------------------------------------------------------------------------------------------
-
-
-def run_batch(
-    verb: str,
-    entries: list[Entry],
-    out: Path,
-    work: Work,
-    *,
-    jobs: int = 0,
-    overwrite: bool = False,
-    shard_text: str = "",
-    listed: Path | None = None,
-) -> dict[str, Any]:
-    """Do ``work`` for every entry, ``jobs`` processes at a time.
+def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
+    """Run the steps of a batch, or submit the tasks that do.
 
     Args:
-        verb: for messages.
-        out: ROOT; ``ROOT/status.json`` (with a shard: ``status-i-of-n.json``) tells the outcome.
-        jobs: processes; 0 = as many as there are processors. They share the processors.
-        overwrite: replace results of other settings.
-        listed: the list, where it is a file.
+        dry: only say what there is to do.
 
     Returns:
-        ``scenes`` (one record each), counts, ``text``: the table for people, and ``exit_code``: 0, or 10 plus the number of
-        failed scenes, at most 99.
+        Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99), or 143 if it was asked to
+        stop.
 
     Raises:
-        UsageError: ``jobs`` is negative; an output touches a source, or the status another file. KeyboardInterrupt: the
-            running scenes are stopped.
+        UsageError: settings that contradict each other, or an output that belongs to another batch. InputError: a bad list.
     """
-    suffix = "-" + shard_text.replace("/", "-of-") if shard_text else ""
-    status = out / f"status{suffix}.json"
-    _refuse_overlaps(entries, out, status, listed)
-    if jobs < 0:
-        raise UsageError("number of jobs cannot be negative", where="--jobs", got=str(jobs))
-    jobs = min(jobs or native.default_threads(), max(len(entries), 1))
-    threads = max(1, native.default_threads() // jobs)
-    log.info(f"{verb}: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
-    outcomes: dict[str, Outcome] = {}
-    with processes.child_environment(threads, torch_threads=threads), log.task(verb, len(entries)) as bar:
-        for outcome in _run_all(entries, out, work, jobs, overwrite):
-            outcomes[outcome.name] = outcome
-            bar.advance()
-            if outcome.state == "failed":
-                log.warn(f"{verb}: {outcome.name} failed: {outcome.words}")
-    ordered = [outcomes[entry.name] for entry in entries]
-    counts = {state: sum(o.state == state for o in ordered) for state in ("done", "reused", "failed")}
-    store.write_json(status, {"schema": 1, "verb": verb, "counts": counts, "scenes": [asdict(o) for o in ordered]})
-    code = min(FAILED_BASE + counts["failed"], FAILED_MOST) if counts["failed"] else 0
-    return {
-        "scenes": [asdict(outcome) for outcome in ordered], **counts, "status": status, "text": table(verb, ordered),
-        "exit_code": code,
-    }  # fmt: skip
+    entries = [_absolute(entry) for entry in read_list(asked.listed, (*OF_A_LINE, REVISION))]
+    plan = plan_for(asked.batch, asked.run)
+    folder, rules = BatchFolder(Location.of(asked.out)), rules_of(asked.batch)
+    if folder.out.local is not None:
+        folder = BatchFolder(Location.of(folder.out.local.absolute()))
+    _refuse_overlap(entries, folder, asked.listed)
+    if dry:
+        return _dry(folder, plan, entries)
+    folder.begin(plan, entries)
+    if asked.batch.engine in ("slurm", "ray"):
+        return engines.submitted(engines.Submission(asked.batch, folder, asked.words, asked.wait, WorkRequest(folder, plan, entries, rules)))
+    shard = engines.shard_of_environment(asked.batch.shards) if asked.batch.engine == "env" else (0, 1)
+    jobs = asked.batch.jobs or (native.default_threads() if asked.batch.engine == "local" else 1)
+    jobs = min(jobs, max(1, sum(shard_of(entry.name, shard[1]) == shard[0] for entry in entries)))
+    rules = replace(rules, threads=max(1, native.default_threads() // jobs))
+    log.info(f"batch: {len(entries)} scenes, shard {shard[0]} of {shard[1]}, {jobs} at a time with {rules.threads} threads each")
+    with log.task("batch", len(entries) * len(plan.stages)) as bar:
+        ended = run_workers(WorkRequest(folder, plan, entries, rules, shard), jobs, lambda _: bar.advance())
+    return _told(folder, ended)
 
 
-def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
-    """UsageError where a scene's output touches any source or the list, or the status would replace another file."""
-    read: dict[str, Path | str | None] = {
-        f"source of {entry.name}": entry.source for entry in entries if entry.source != "city"
+def _told(folder: BatchFolder, ended: WorkersEnd) -> dict[str, Any]:
+    bad = sum(count for state, count in ended.counts.items() if state != "done")
+    code = ASKED_TO_STOP if ended.stopped else min(FAILED_BASE + bad, FAILED_MOST) if bad else 0
+    text = ", ".join(f"{count} {state}" for state, count in sorted(ended.counts.items())) or "nothing was left to do here"
+    if ended.gave_up:
+        text += "; stopped: more steps have failed than --max-failures allows"
+        code = code or FAILED_BASE
+    if ended.stopped:
+        text += "; stopped as asked, the same command goes on"
+    return {"counts": dict(ended.counts), "out": str(folder.out), "text": f"{text}\nmudg batch status {folder.out}", "exit_code": code}
+
+
+def plan_for(batch: BatchConfig, settings: RunConfig) -> BatchPlan:
+    """The plan that settings ask for; paths in the settings that exist from here are made absolute, since steps run elsewhere."""
+    values = _with_absolute_paths(configuration.to_dict(settings))
+    own = bool(batch.command) and batch.stages == BatchConfig().stages
+    command = tuple(_absolute_program(word) for word in batch.command)
+    return plan_of(() if own else tuple(name for name in batch.stages if name != COMMAND or command), values, command)
+
+
+def _with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
+    made: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            made[name] = _with_absolute_paths(value)
+        else:
+            made[name] = os.path.abspath(value) if isinstance(value, str) and "/" in value and os.path.exists(value) else value
+    return made
+
+
+def _absolute_program(word: str) -> str:
+    return os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word
+
+
+def rules_of(batch: BatchConfig) -> WorkRules:
+    """Rules of the workers; UsageError where a setting cannot be read."""
+    if batch.max_failures and not _LIMIT.fullmatch(batch.max_failures):
+        raise UsageError("not a number of failures", where="--max-failures", got=batch.max_failures, expected="as 20 or 5%")
+    return WorkRules(
+        lease_s=batch.lease_s, grace_s=batch.grace_s, patience_s=batch.patience_s, steal=batch.steal,
+        bounds=quality.parse_bounds(batch.bounds), second_share=batch.verify_share, most_failures=batch.max_failures,
+        scratch=Path(batch.scratch).absolute() if batch.scratch else None,
+    )  # fmt: skip
+
+
+def _absolute(entry: Entry) -> Entry:
+    settings = {
+        name: os.path.abspath(value) if name in _PATHS and os.path.exists(value) else value for name, value in entry.settings.items()
     }
-    read["list"] = listed if listed is not None and listed.is_file() else None
-    refuse_overlaps([status, *(out / entry.name for entry in entries)], read)
-    if status.exists():
-        try:
-            known = {"schema", "verb", "counts", "scenes"} <= set(store.read_json(status))
-        except (InputError, TypeError):
-            known = False
-        if not known:
-            raise UsageError(
-                "the status file would replace a file that does not belong to this list", where=str(status), remedy="choose another --out"
-            )
+    if entry.source == CITY or "://" in entry.source:
+        return Entry(entry.name, entry.source, settings)
+    return Entry(entry.name, os.path.abspath(entry.source), settings)
 
 
-def _run_all(entries: list[Entry], out: Path, work: Work, jobs: int, overwrite: bool) -> Iterator[Outcome]:
-    context = multiprocessing.get_context("spawn")
-    waiting = list(reversed(entries))
-    running: dict[Connection, tuple[Entry, Any, float]] = {}
-    try:
-        while waiting or running:
-            while waiting and len(running) < jobs:
-                entry = waiting.pop()
-                ours, theirs = context.Pipe(duplex=False)
-                process = context.Process(
-                    target=_child, args=(theirs, work, entry, out / entry.name, overwrite), name=f"mudg {entry.name}"
-                )
-                process.start()
-                theirs.close()
-                running[ours] = (entry, process, time.monotonic())
-            ready = set(wait(list(running)))
-            for connection in [one for one in running if one in ready]:
-                entry, process, started = running.pop(connection)
-                yield _outcome(entry, connection, process, time.monotonic() - started)
-    finally:
-        for _, process, _ in running.values():
-            process.terminate()
-        for _, process, _ in running.values():
-            process.join()
+def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) -> None:
+    out, place = folder.out.local, Location.of(listed).local
+    if out is None:
+        return
+    read: dict[str, Path | str | None] = {
+        f"source of {entry.name}": entry.source for entry in entries if entry.source != CITY and "://" not in entry.source
+    }
+    read["list"] = place if place is not None and place.is_file() else None
+    refuse_overlaps([out], read)
 
 
-def _outcome(entry: Entry, connection: Connection, process: Any, seconds: float) -> Outcome:
-    """What the process said, or how it ended without a word."""
-    try:
-        state, words, error = json.loads(connection.recv_bytes())
-    except EOFError:
-        state, words, error = "failed", "", "crash"
-    connection.close()
-    process.join()
-    if error == "crash":
-        code = process.exitcode or 0
-        words = f"its process ended with code {code}; see the messages above"
-        if code < 0:
-            words = f"its process was killed by signal {-code}"
-        if -code == signal.SIGKILL:
-            words += " (out of memory? try fewer --jobs)"
-    return Outcome(entry.name, entry.source, state, round(seconds, 2), words, error)
+def _dry(folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry]) -> dict[str, Any]:
+    done, failed = folder.keys("done"), folder.keys("failed")
+    keys = [unit.key for entry in entries for unit in plan.units(entry)]
+    counts = {
+        "scenes": len(entries), "steps": len(keys), "done": sum(key in done for key in keys), "failed": sum(key in failed for key in keys),
+    }  # fmt: skip
+    left = counts["steps"] - counts["done"] - counts["failed"]
+    words = " -> ".join(stage.name for stage in plan.stages)
+    text = f"{counts['scenes']} scenes: {words}\n{counts['done']} steps done, {counts['failed']} failed, {left} to do"
+    return {**counts, "left": left, "text": text}
 
 
-def _child(connection: Connection, work: Work, entry: Entry, folder: Path, overwrite: bool) -> None:
-    """In the process of one scene."""
-    signal.signal(
-        signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM)
-    )  # unwinds, so that partial folders are removed
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides, and terminates
-    log.set_quiet(True)
-    before = _finished(folder)
-    try:
-        try:
-            work(entry, folder, overwrite)
-        except UsageError:
-            if overwrite or before or not _unfinished(folder):
-                raise
-            work(entry, folder, True)  # what an earlier failure left of another state of the source
-        reused = before != "" and before == _finished(folder)
-        connection.send_bytes(json.dumps(["reused" if reused else "done", _contents(folder), ""]).encode())
-    except Exception as failed:
-        error = failures.in_words(failed)
-        if error is None:
-            raise
-        parts = (
-            error.what,
-            error.where,
-            error.expected and f"expected {error.expected}",
-            error.got and f"got {error.got}",
-        )
-        words = "; ".join(part for part in parts if part)
-        connection.send_bytes(json.dumps(["failed", words, type(error).__name__]).encode())
-    finally:
-        connection.close()
+def show_status(out: str, html: bool = False) -> dict[str, Any]:
+    """How far a batch is. html: also write ``status.html`` in its folder."""
+    found = status.read_status(BatchFolder(Location.of(out)))
+    result: dict[str, Any] = {**found.record(), "text": status.text_of(found)}
+    if html:
+        page = Location.of(out) / "status.html"
+        page.save(status.page_of(found).encode())
+        result["page"] = str(page)
+        result["text"] += f"\npage: {page}"
+    return result
 
 
-def _state(folder: Path) -> Mapping[str, Any]:
-    try:
-        state = store.read_json(folder / "run.json")
-    except InputError:
-        return {}
-    return state if isinstance(state, dict) else {}
+def show_cost(out: str, price: float, storage_price: float) -> dict[str, Any]:
+    """What a batch took, by step, and what the rest is going to take."""
+    found = costs.costs_of(status.read_status(BatchFolder(Location.of(out))), price, storage_price)
+    return {**found, "text": costs.text_of(found)}
 
 
-def _finished(folder: Path) -> str:
-    """What tells one finished result from another; empty if there is none."""
-    state = _state(folder)
-    if state.get("state") != "complete":
-        return ""
-    return f"{state.get('key')} {(folder / 'run.json').stat().st_mtime_ns}"
+def watch_status(out: str, html: bool, every_s: float) -> dict[str, Any]:
+    """``show_status``, again and again until nothing is left; 0 s: once."""
+    while True:
+        found = show_status(out, html)
+        if every_s <= 0 or not found["left"]:
+            return found
+        log.info(found["text"])
+        time.sleep(every_s)
 
 
-def _unfinished(folder: Path) -> bool:
-    return _state(folder).get("state") in ("running", "interrupted")
+def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:
+    """Settings of the steps: a preset, then a file of ``mudg run``, then ``STEP.NAME=VALUE``.
+
+    Raises:
+        UsageError: an unknown setting or a value out of range.
+    """
+    values: dict[str, Any] = {}
+    for text in given:
+        name, separator, value = text.partition("=")
+        if not separator or not name:
+            raise UsageError("not a setting", where="--set", got=text, expected="STEP.NAME=VALUE, as fit.iterations=500")
+        values[name] = parse_yaml(value.encode(), f"--set {name}") if value else ""
+    return configuration.load(RunConfig, run_preset(preset), config, configuration.nested(values))
 
 
-def _contents(folder: Path) -> str:
-    summary = _state(folder).get("summary", {})
-    return ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str))
+def retry(out: str, reason: str = "") -> dict[str, Any]:
+    """Forget failures, so that the next ``mudg batch run`` tries them again. reason: codes or names, with commas (empty: all).
 
-
-def table(verb: str, outcomes: Sequence[Outcome]) -> str:
-    """The outcomes as a table, failures last."""
-    from rich.console import Console
-    from rich.table import Table
-
-    grid = Table(title=f"mudg {verb}", title_justify="left")
-    for column in ("scene", "state", "seconds", "what it holds, or why it failed"):
-        grid.add_column(column, overflow="fold", justify="right" if column == "seconds" else "left")
-    for outcome in sorted(outcomes, key=lambda o: o.state == "failed"):
-        grid.add_row(outcome.name, outcome.state, f"{outcome.seconds:.1f}", outcome.words)
-    out = io.StringIO()
-    Console(file=out, width=int(os.environ.get("COLUMNS") or 120), markup=False, highlight=False).print(grid)
-    failed = sum(outcome.state == "failed" for outcome in outcomes)
-    out.write(
-        f"{len(outcomes) - failed} of {len(outcomes)} scenes are there" + (f", {failed} failed" if failed else "")
-    )
-    return out.getvalue()
+    Raises:
+        InputError: no batch is here. UsageError: an unknown reason.
+    """
+    folder, wanted = BatchFolder(Location.of(out)), retries.parse_reasons(reason)
+    folder.plan()
+    forgotten: list[str] = []
+    by_key = status.read_status(folder).failures
+    for key, failure in by_key.items():
+        if not wanted or failure.code in wanted:
+            folder.failed(key).remove()
+            forgotten.append(key)
+    if not forgotten and wanted:
+        raise InputError("nothing failed for this reason", where=str(folder.out), got=reason,
+            expected=", ".join(sorted({str(one.code) for one in by_key.values()})) or "no failures at all")  # fmt: skip
+    return {"forgotten": len(forgotten), "text": f"{len(forgotten)} failed steps will be tried again by the next mudg batch run"}

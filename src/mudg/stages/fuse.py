@@ -6,7 +6,6 @@ Images of held-out frames give no colours, so that nothing of what is scored lat
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,8 @@ from mudg.core.fusion import (
 from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.report.top_view import TopView, draw_top_view
-from mudg.stages import batch
+from mudg.stages.batches import lists
+from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.config import FuseConfig
 
 _OUTPUT = VerbOutput("fuse", 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
@@ -77,14 +77,9 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
 def run_many(
     config: FuseConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
 ) -> dict[str, Any]:
-    """``run`` for every scene of a list; see ``stages/batch.py``."""
-    entries = batch.shard(batch.read_list(listed), shard)
-    work = functools.partial(_one_of_many, config)
-    return batch.run_batch("fuse", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed)
-
-
-def _one_of_many(config: FuseConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
-    return run(config, Path(entry.source), out, overwrite=overwrite)
+    """``run`` for every scene of a list; see ``stages/batches/listed.py``."""
+    entries = lists.read_list(listed)
+    return run_listed(ListedRun("fuse", config, entries, out, jobs, overwrite, shard, listed))
 
 
 def rules_of(config: FuseConfig) -> FusionRules:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
@@ -21,7 +20,9 @@ from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_
 from mudg.data.scene import SCENE_FILES, SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
 from mudg.report import contact_sheet
-from mudg.stages import batch
+from mudg.stages.batches import lists
+from mudg.stages.batches.listed import ListedRun, run_listed
+from mudg.stages.batches.plan import OF_A_LINE
 from mudg.stages.config import IngestConfig
 
 CITY = "city"
@@ -137,26 +138,13 @@ def parse_arguments(
     return config, source, out
 
 
-_OF_A_LINE = ("format", "frames", "cameras", "sequence", "poses", "boxes")
-
-
 def run_many(
     config: IngestConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
 ) -> dict[str, Any]:
-    """``run`` for every log of a list; see ``stages/batch.py``. A line may set format, sequence, frames, cameras (with
+    """``run`` for every log of a list; see ``stages/batches/listed.py``. A line may set format, sequence, frames, cameras (with
     commas), poses and boxes for itself."""
-    entries = batch.shard(batch.read_list(listed, _OF_A_LINE), shard)
-    work = functools.partial(_one_of_many, config)
-    return batch.run_batch(
-        "ingest", entries, out, work, jobs=jobs, overwrite=overwrite, shard_text=shard, listed=listed
-    )
-
-
-def _one_of_many(config: IngestConfig, entry: batch.Entry, out: Path, overwrite: bool) -> Path:
-    own: dict[str, Any] = dict(entry.settings)
-    if "cameras" in own:
-        own["cameras"] = tuple(own["cameras"].split(","))
-    return run(replace(config, **own), entry.source, out, overwrite=overwrite)
+    entries = lists.read_list(listed, OF_A_LINE)
+    return run_listed(ListedRun("ingest", config, entries, out, jobs, overwrite, shard, listed))
 
 
 _SCENE = "scene"

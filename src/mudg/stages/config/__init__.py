@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mudg.stages.config.adapt import AdaptConfig
+    from mudg.stages.config.batch import BatchConfig
     from mudg.stages.config.bench import BenchConfig
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.edit import EditConfig
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.views import RenderConfig, ScoreConfig
 
 _HOMES = {
+    "BatchConfig": "mudg.stages.config.batch",
     "BenchConfig": "mudg.stages.config.bench",
     "ConvertConfig": "mudg.stages.config.convert",
     "EditConfig": "mudg.stages.config.edit",
@@ -60,6 +62,7 @@ __all__ = [
     "PRESETS",
     "AdaptConfig",
     "AnnotateConfig",
+    "BatchConfig",
     "BenchConfig",
     "ConvertConfig",
     "EditConfig",

@@ -1,0 +1,223 @@
+"""Where a result is made before it is published.
+
+    WORK/<key>.<attempt>/      inputs/<step>   source   settings.yaml   result
+    WORK/<key>.left/           what an attempt left that failed or was stopped; the next one goes on with it
+
+Commands run in this folder and name what is in it by relative names, so that a result does not depend on where it was made. An attempt
+that takes over renames the folder of the one before: a worker that was only slow finds its folder gone, and fails.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, IntegrityError, MudgError, ResourceError
+from mudg.base.location import Location
+from mudg.stages.batches.folders import BatchFolder
+from mudg.stages.batches.lists import CITY
+from mudg.stages.batches.plan import Unit, command_of
+
+RESULT: Final = "result"
+SETTINGS: Final = "settings.yaml"
+
+
+class WorkFolder:
+    """The folder of one attempt at one step of a scene."""
+
+    def __init__(self, folder: BatchFolder, unit: Unit, attempt: int, scratch: Path | None) -> None:
+        self._folder, self._unit, self._attempt = folder, unit, attempt
+        self._given_scratch = scratch
+        self.in_output = folder.out.local is not None and scratch is None
+        root = folder.work.local if self.in_output and folder.work.local is not None else (scratch or default_scratch()) / "mudg_batch"
+        self._root = root.absolute()
+        self.path = self._root / f"{unit.key}.{attempt}"
+        self.cwd: Path | None = self.path
+        """Where the command runs; None: where this program runs."""
+
+    @property
+    def result(self) -> Path:
+        """The folder that the step's command writes."""
+        return self.path / RESULT
+
+    @property
+    def _left(self) -> Path:
+        return self._root / f"{self._unit.key}.left"
+
+    @property
+    def _published(self) -> Location:
+        return self._folder.out / self._unit.place
+
+    def adopted(self) -> Path | None:
+        """The published result, if a worker that was cut off left one without a commit record."""
+        place = self._published.local
+        if not self.in_output or place is None or not place.exists():
+            return None
+        if (place / store.MANIFEST).is_file():
+            try:
+                store.verify_manifest(place)
+                store.verify_record(place)
+            except (IntegrityError, InputError):
+                log.warn(f"{place} is damaged and is made again")
+                place.rename(self._root / f"{self._unit.key}.damaged")
+                return None
+        return place
+
+    def prepare(self) -> None:
+        """Make the folder, with what earlier attempts left, and stage in what the command reads."""
+        self._take_over()
+        store.make_folder(self.path)
+        for name, key in self._unit.needs.items():
+            self._stage_in(self._folder.out / f"{self._unit.entry.name}/{name}/{key[:12]}", self.path / "inputs" / name)
+        self._stage_in_source()
+        self._write_settings()
+
+    def _write_settings(self) -> None:
+        if self._unit.stage.settings:
+            text = yaml.safe_dump(dict(self._unit.stage.settings), sort_keys=False)
+            store.write_in_tree(self.path / SETTINGS, text.encode())
+
+    def _take_over(self) -> None:
+        earlier = [self._left, *(self._root / f"{self._unit.key}.{number}" for number in range(self._attempt - 1, 0, -1))]
+        for one in earlier:
+            if one.is_dir() and not self.path.exists():
+                with contextlib.suppress(FileNotFoundError):
+                    one.rename(self.path)
+                    for lock in self.path.rglob("lock"):  # of a run whose folder this was
+                        lock.unlink(missing_ok=True)
+        partial = self._folder.partial(self._unit.key)
+        if not self.in_output and not self.path.exists() and partial.exists():
+            try:
+                partial.fetch(self.result)
+            except MudgError as error:
+                log.warn(f"{self._unit.title}: what an earlier attempt made cannot be used: {error.what}")
+                shutil.rmtree(self.path, ignore_errors=True)
+
+    def _stage_in(self, source: Location, to: Path) -> None:
+        if to.is_symlink() or to.exists():
+            return
+        local = source.local
+        if local is None:
+            source.fetch(to)
+            return
+        store.make_folder(to.parent)
+        with contextlib.suppress(FileExistsError):
+            to.symlink_to(os.path.abspath(local))
+
+    def _stage_in_source(self) -> None:
+        source = self._unit.entry.source
+        if "{source}" in " ".join(self._unit.stage.words) and "://" in source:
+            place = Location.of(source)
+            place.fetch(self.path / "source" / place.name)
+
+    def command(self) -> list[str]:
+        """The step's command line, to be run in ``path``."""
+        source = self._unit.entry.source
+        if source != CITY:
+            source = f"source/{Location.of(source).name}" if "://" in source else os.path.abspath(source)
+        places = {"source": source, **{name: f"inputs/{name}" for name in self._unit.needs}}
+        return command_of(self._unit, places, RESULT, SETTINGS if self._unit.stage.settings else "")
+
+    def replacing(self) -> list[str] | None:
+        """The command that replaces what an earlier failure left of another state of the source; None where nothing such is."""
+        return None
+
+    def publish(self) -> None:
+        """Bring the result to its place in the output. Somebody else's result of the same key is as good."""
+        place = self._published
+        if not self.in_output or place.local is None:
+            place.push(self.result)
+            return
+        store.make_folder(place.local.parent)
+        try:
+            self.result.rename(place.local)
+        except OSError as error:
+            if not place.local.exists():
+                raise ResourceError("the result cannot be moved to its place", where=str(place), got=str(error)) from error
+        store.fsync_directory(place.local.parent)
+
+    def leave(self, stopped: bool) -> None:
+        """Keep an unfinished result for the next attempt: here, and where others can have it if this worker was asked to stop."""
+        if not self.path.is_dir():
+            return
+        if stopped and not self.in_output and self.result.is_dir():
+            self._folder.partial(self._unit.key).push(self.result)
+        if self.in_output or (stopped is False and (self.result / store.RUN_STATE).is_file()):
+            shutil.rmtree(self._left, ignore_errors=True)
+            self.path.rename(self._left)
+        else:
+            self.remove()
+
+    def second(self) -> WorkFolder:
+        """A folder for a second run from nothing."""
+        unit = replace(self._unit, key=f"{self._unit.key}.second")
+        made = WorkFolder(self._folder, unit, self._attempt, self._given_scratch)
+        made.remove()
+        return made
+
+    def remove(self) -> None:
+        """Remove the folder, and what was put elsewhere for other workers."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        if not self.in_output:
+            with contextlib.suppress(MudgError):
+                partial: Any = self._folder.partial(self._unit.key)
+                if partial.exists():
+                    partial.remove()
+
+
+class DirectFolder(WorkFolder):
+    """The folder of a step that makes its result right where it belongs. The verb itself resumes, verifies and replaces there."""
+
+    def __init__(self, folder: BatchFolder, unit: Unit, attempt: int) -> None:
+        super().__init__(folder, unit, attempt, None)
+        self.cwd = None
+        local = (folder.out / unit.place).local
+        self._result = local if local is not None else self.path
+
+    @property
+    def result(self) -> Path:
+        return self._result
+
+    def adopted(self) -> Path | None:
+        return None
+
+    def prepare(self) -> None:
+        store.make_folder(self.path)
+        self._write_settings()
+
+    def command(self) -> list[str]:
+        source = self._unit.entry.source
+        return command_of(self._unit, {"source": source}, str(self.result), str(self.path / SETTINGS))
+
+    def replacing(self) -> list[str] | None:
+        words = self.command()
+        try:
+            unfinished = store.read_json(self.result / store.RUN_STATE)["state"] in ("running", "interrupted")
+        except (InputError, KeyError, TypeError):
+            unfinished = False
+        return [*words, "--overwrite"] if unfinished and "--overwrite" not in words else None
+
+    def publish(self) -> None:
+        pass
+
+    def leave(self, stopped: bool) -> None:
+        self.remove()
+
+
+def work_folder(folder: BatchFolder, unit: Unit, attempt: int, scratch: Path | None) -> WorkFolder:
+    """The folder of an attempt."""
+    return DirectFolder(folder, unit, attempt) if unit.stage.direct else WorkFolder(folder, unit, attempt, scratch)
+
+
+def default_scratch() -> Path:
+    """Folder for temporary files of this machine."""
+    import tempfile
+
+    return Path(os.environ.get("SLURM_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir())
