@@ -216,12 +216,12 @@ def _batch(args: f.BatchFlags) -> dict[str, Any]:
         if not args.list:
             raise UsageError("no list was given", expected="--list FILE, with one source per line")
         settings = batch.settings_of(args.preset, args.config, args.set)
-        asked = batch.BatchRequest(args.list, place, args.batch, settings, tuple(sys.argv[1:]), args.wait)
+        asked = batch.BatchRequest(args.list, place, args.settings, settings, tuple(sys.argv[1:]), args.wait)
         return batch.run(asked, args.dry_run)
     if args.action == "status":
         return batch.watch_status(place, args.html, args.watch_s)
     if args.action == "cost":
-        return batch.show_cost(place, args.batch.price, args.batch.storage_price)
+        return batch.show_cost(place, args.settings.price, args.settings.storage_price)
     return batch.retry(place, args.reason)
 
 

@@ -387,7 +387,7 @@ class BatchFlags(Common):
     """status: also write OUT/status.html, with figures of the logs."""
     watch_s: float = 0.0
     """status: show it again every so many seconds, until nothing is left (0 = once)."""
-    batch: Annotated[stage_config.BatchConfig, arg(name="")]
+    settings: Annotated[stage_config.BatchConfig, arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -495,7 +495,7 @@ def _settings(kind: type[Any], words: Sequence[str]) -> Any:
             return kind()
     whole_chain = kind is stage_config.RunConfig
     config = stage_config.run_preset(stage_config.chosen_preset(known.preset, known.fast)) if whole_chain else kind()
-    if known.config is not None:
+    if known.config is not None and kind is not stage_config.BatchConfig:  # there, the file is one of mudg run
         config = configuration.load(kind, config, known.config)
     if whole_chain and known.seed is not None:
         config = stage_config.with_seed(config, known.seed)

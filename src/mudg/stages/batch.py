@@ -76,7 +76,8 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
         return _dry(folder, plan, entries)
     folder.begin(plan, entries)
     if asked.batch.engine in ("slurm", "ray"):
-        return engines.submitted(engines.Submission(asked.batch, folder, asked.words, asked.wait, WorkRequest(folder, plan, entries, rules)))
+        work = WorkRequest(folder, plan, entries, rules)
+        return engines.submitted(engines.Submission(asked.batch, folder, asked.words, asked.wait, work))
     shard = engines.shard_of_environment(asked.batch.shards) if asked.batch.engine == "env" else (0, 1)
     jobs = asked.batch.jobs or (native.default_threads() if asked.batch.engine == "local" else 1)
     jobs = min(jobs, max(1, sum(shard_of(entry.name, shard[1]) == shard[0] for entry in entries)))

@@ -28,8 +28,9 @@ def costs_of(state: BatchStatus, price: float, storage_price: float) -> dict[str
         left = max(0, state.entering(name) - one.done - one.failed - one.rejected)
         money = (hours + lost) * price + size * storage_price
         stages[name] = {
-            "scenes": one.known, "core_hours": round(hours, 4), "lost_hours": round(lost, 4), "gigabytes": round(size, 4), "money": round(money, 4),
-            "core_hours_per_scene": round(per_scene, 6), "left": left, "core_hours_left": round(per_scene * left, 4),
+            "scenes": one.known, "core_hours": round(hours, 4), "lost_hours": round(lost, 4), "gigabytes": round(size, 4),
+            "money": round(money, 4), "core_hours_per_scene": round(per_scene, 6), "left": left,
+            "core_hours_left": round(per_scene * left, 4),
             "money_left": round((per_scene * price + size / done * storage_price) * left, 4),
         }  # fmt: skip
     total = {
@@ -41,17 +42,14 @@ def costs_of(state: BatchStatus, price: float, storage_price: float) -> dict[str
 
 def text_of(found: dict[str, Any]) -> str:
     """The costs as a table."""
-    lines = [f"  {'step':<12}{'scenes':>8}{'core-hours':>12}{'lost':>9}{'written':>12}{'cost':>11}{'left':>8}{'core-hours left':>17}{'cost left':>12}"]
-    for name, one in found["stages"].items():
+    heads = f"{'scenes':>8}{'core-hours':>12}{'lost':>9}{'written':>12}{'cost':>11}{'left':>8}"
+    lines = [f"  {'step':<12}{heads}{'core-hours left':>17}{'cost left':>12}"]
+    for name, one in {**found["stages"], "total": {"scenes": "", "left": "", **found["total"]}}.items():
+        size = in_words(int(one["gigabytes"] * _GB))
         lines.append(
-            f"  {name:<12}{one['scenes']:8.0f}{one['core_hours']:12.3f}{one['lost_hours']:9.3f}{in_words(int(one['gigabytes'] * _GB)):>12}"
-            f"{one['money']:11.2f}{one['left']:8.0f}{one['core_hours_left']:17.3f}{one['money_left']:12.2f}"
+            f"  {name:<12}{one['scenes']:>8}{one['core_hours']:12.3f}{one['lost_hours']:9.3f}{size:>12}"
+            f"{one['money']:11.2f}{one['left']:>8}{one['core_hours_left']:17.3f}{one['money_left']:12.2f}"
         )
-    total = found["total"]
-    lines.append(
-        f"  {'total':<20}{total['core_hours']:12.3f}{total['lost_hours']:9.3f}{in_words(int(total['gigabytes'] * _GB)):>12}{total['money']:11.2f}"
-        f"{'':8}{total['core_hours_left']:17.3f}{total['money_left']:12.2f}"
-    )
     if not found["price"]:
         lines.append("give --price per core-hour, and --storage-price per gigabyte and month, for costs in money")
     return "\n".join(lines)

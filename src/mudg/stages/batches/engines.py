@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from mudg.base.errors import UsageError
+from mudg.stages.batches import on_ray, slurm
 from mudg.stages.batches.folders import BatchFolder
 from mudg.stages.batches.work import WorkRequest
 from mudg.stages.config.batch import BatchConfig
@@ -64,6 +65,38 @@ def shard_of_environment(shards: int, environment: Mapping[str, str] | None = No
         expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment")  # fmt: skip
 
 
+class Engine(Protocol):
+    """What the engines have in common."""
+
+    def submit(self) -> str:
+        """Hand the tasks over; returns what the engine calls them."""
+        ...
+
+    def poll(self) -> int:
+        """Tasks that wait or run."""
+        ...
+
+    def cancel(self) -> None:
+        """Stop them, with checkpoints."""
+        ...
+
+
 def submitted(asked: Submission) -> dict[str, Any]:
-    """Submit the tasks of a batch to Slurm or Ray."""
-    raise UsageError("this engine is not there", where="--engine", got=asked.batch.engine)
+    """Submit the tasks of a batch to Slurm, or run them on a Ray cluster."""
+    batch, here = asked.batch, os.getcwd()
+    words = slurm.task_words(asked.words, batch.shards)
+    if batch.engine == "slurm":
+        local = asked.folder.own.local
+        output = str(local / "slurm" / "%A_%a.txt") if local is not None else f"{here}/mudg-batch-%A_%a.txt"
+        job = slurm.SlurmJob(words, batch.shards, here, output, batch.grace_s, batch.slurm_at_once, batch.slurm_options)
+        array = slurm.SlurmArray(job)
+        number = array.submit()
+        if asked.wait:
+            array.wait()
+        text = f"job {number} with {batch.shards} tasks; its messages: {output}\nmudg batch status {asked.folder.out}"
+        return {"job": number, "shards": batch.shards, "out": str(asked.folder.out), "text": text}
+    tasks = on_ray.RayTasks(on_ray.RayJob(words, batch.shards, here, batch.ray_address, max(1, batch.jobs), batch.ray_gpus))
+    tasks.submit()
+    code = on_ray.worst_of(tasks.wait())
+    text = f"{batch.shards} tasks have ended\nmudg batch status {asked.folder.out}"
+    return {"shards": batch.shards, "out": str(asked.folder.out), "text": text, "exit_code": code}
