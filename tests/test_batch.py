@@ -1,10 +1,9 @@
-"""Many scenes: lists, shards, failures that stop nothing else, repeats that redo nothing, exit codes."""
+"""One verb over many scenes: lists, shards, failures that stop nothing else, repeats that redo nothing, exit codes."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
+import sys
 from pathlib import Path
 
 import kitti_folders as made
@@ -14,27 +13,31 @@ from toy_scene import ToyStreet
 from mudg import cli
 from mudg.base.errors import InputError, UsageError
 from mudg.data.scene import read_scene
-from mudg.stages import batch
+from mudg.stages.batches import lists
+from mudg.stages.batches.listed import ListedRun, run_listed
+from mudg.stages.batches.plan import BatchPlan, BatchStage
 
-
-def ok(entry: batch.Entry, out: Path, overwrite: bool) -> Path:
-    """Works, fails or dies as its source says."""
-    if entry.source.endswith("bad"):
-        raise InputError("it is broken", where=entry.source, got="nothing")
-    if entry.source.endswith("killed"):
-        os.kill(os.getpid(), signal.SIGKILL)
-    if entry.source.endswith("bug"):
-        raise ZeroDivisionError
-    out.mkdir(parents=True)
-    (out / "threads").write_text(os.environ["MUDG_THREADS"])
-    return out
+STEP = """
+import os, signal, sys
+source, out = sys.argv[1:3]
+if source.endswith("bad"):
+    sys.stderr.write("error: it is broken\\n  where: bad\\n  got: nothing\\n")
+    sys.exit(3)
+if source.endswith("killed"):
+    os.kill(os.getpid(), signal.SIGKILL)
+if source.endswith("bug"):
+    raise ZeroDivisionError
+os.makedirs(out)
+open(os.path.join(out, "threads"), "w").write(os.environ["MUDG_THREADS"])
+"""
+"""Works, fails or dies as its source says."""
 
 
 def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text(
         "# drives\n\na/drive_1\n'b/drive 2' name=two sequence=07\n/abs/drive_3.zip   # comment\ncity name=c\n"
     )
-    entries = batch.read_list(tmp_path / "list.txt", ("sequence",))
+    entries = lists.read_list(tmp_path / "list.txt", ("sequence",))
     assert [(e.name, e.source, dict(e.settings)) for e in entries] == [
         ("drive_1", str(tmp_path / "a/drive_1"), {}),
         ("two", str(tmp_path / "b/drive 2"), {"sequence": "07"}),
@@ -44,7 +47,7 @@ def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
     (tmp_path / "scenes").mkdir()
     for name in ("b", "a", ".hidden"):
         (tmp_path / "scenes" / name).mkdir()
-    assert [e.name for e in batch.read_list(tmp_path / "scenes")] == ["a", "b"]
+    assert [e.name for e in lists.read_list(tmp_path / "scenes")] == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -57,23 +60,29 @@ def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
 def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "list.txt").write_text(text)
     with pytest.raises(InputError, match=words):
-        batch.read_list(tmp_path / "list.txt")
+        lists.read_list(tmp_path / "list.txt")
 
 
-def test_shards_are_a_partition() -> None:
-    entries = [batch.Entry(str(n), str(n)) for n in range(10)]
-    parts = [batch.shard(entries, f"{i}/3") for i in range(3)]
-    assert sorted(int(e.name) for part in parts for e in part) == list(range(10))
-    assert max(map(len, parts)) - min(map(len, parts)) <= 1
-    assert batch.shard(entries, "") == entries
+def test_shards_are_a_partition_that_growing_lists_keep() -> None:
+    entries = [lists.Entry(str(n), str(n)) for n in range(60)]
+    parts = [lists.shard(entries, f"{i}/3") for i in range(3)]
+    assert sorted(int(e.name) for part in parts for e in part) == list(range(60))
+    assert min(map(len, parts)) >= 10
+    for part, fewer in zip(parts, [lists.shard(entries[:20], f"{i}/3") for i in range(3)], strict=True):
+        assert part[: len(fewer)] == fewer
+    assert lists.shard(entries, "") == entries
     for text in ("3/3", "1", "a/b", "-1/3", "1/0"):
         with pytest.raises(UsageError, match="shard"):
-            batch.shard(entries, text)
+            lists.shard(entries, text)
 
 
 def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    entries = [batch.Entry(name, name) for name in ("bad", "killed", "bug", "good")]
-    result = batch.run_batch("ingest", entries, tmp_path, ok, jobs=2, shard_text="1/4")
+    (tmp_path / "step.py").write_text(STEP)
+    names = ("bad", "killed", "bug", "good")
+    words = (sys.executable, str(tmp_path / "step.py"), "{source}", "{out}")
+    plan = BatchPlan((BatchStage("command", words, direct=True),))
+    entries = [lists.Entry(name, f"/logs/{name}") for name in names]
+    result = run_listed(ListedRun("ingest", None, entries, tmp_path / "out", jobs=2, shard_text="0/1"), plan)
     assert result["exit_code"] == 13
     states = {record["name"]: (record["state"], record["words"]) for record in result["scenes"]}
     assert list(states) == ["bad", "killed", "bug", "good"]
@@ -82,8 +91,8 @@ def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.Captur
     assert states["bug"][0] == "failed" and "code 1" in states["bug"][1]
     assert states["good"][0] == "done"
     assert "1 of 4 scenes are there, 3 failed" in result["text"]
-    assert "ZeroDivisionError" in capfd.readouterr().err
-    written = json.loads((tmp_path / "status-1-of-4.json").read_text())
+    assert "ZeroDivisionError" in states["bug"][1] and "warning" in capfd.readouterr().err
+    written = json.loads((tmp_path / "out/status-0-of-1.json").read_text())
     assert written["counts"] == {"done": 1, "reused": 0, "failed": 3}
 
 
@@ -124,17 +133,19 @@ def test_many_scenes_fused_by_shards(tmp_path: Path) -> None:
     for index, name in enumerate(("one", "two", "three")):
         ToyStreet(wall_x=20.0 + index).write(tmp_path / "scenes" / name, width=60, height=30)
     (tmp_path / "scenes" / "status.json").write_text("{}")
+    first = [name for name in ("one", "two", "three") if lists.shard_of(name, 2) == 0]
+    expected = sorted(["_batch", "status-0-of-2.json", *first])
     words = ["fuse", "--list", str(tmp_path / "scenes"), "--out", str(tmp_path / "fused"), "--quiet", "--shard"]
     assert cli.main([*words, "0/2"]) == 0
-    assert sorted(p.name for p in (tmp_path / "fused").iterdir()) == ["one", "status-0-of-2.json", "two"]
+    assert sorted(p.name for p in (tmp_path / "fused").iterdir()) == expected
     assert cli.main([*words, "1/2"]) == 0
     assert (tmp_path / "fused" / "three" / "static.safetensors").is_file()
 
 
 def test_a_folder_as_list_leaves_out_what_an_earlier_list_wrote_there(tmp_path: Path) -> None:
-    for name in ("b", "a.tfrecord", "status.json", "status-3-of-8.json", ".hidden", "status.yaml"):
+    for name in ("b", "a.tfrecord", "_batch", "status.json", "status-3-of-8.json", ".hidden", "status.yaml"):
         (tmp_path / name).write_text("")
-    assert [Path(entry.source).name for entry in batch.read_list(tmp_path)] == ["a.tfrecord", "b", "status.yaml"]
+    assert [Path(entry.source).name for entry in lists.read_list(tmp_path)] == ["a.tfrecord", "b", "status.yaml"]
 
 
 def test_list_flags_alone_make_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

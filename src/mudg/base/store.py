@@ -149,8 +149,12 @@ def sync_tree(folder: Path) -> None:
     fsync_directory(folder)
 
 
-def create_once(path: Path, content: bytes) -> bool:
-    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one succeeds."""
+def create_once(path: Path, content: bytes, durable: bool = True) -> bool:
+    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one succeeds.
+
+    Args:
+        durable: wait until it is on the disk; not for what means nothing after a crash of the machine.
+    """
     path = Path(path)
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
@@ -162,9 +166,13 @@ def create_once(path: Path, content: bytes) -> bool:
             with os.fdopen(fd, "wb") as handle:
                 handle.write(content)
                 handle.flush()
-                os.fsync(handle.fileno())
+                if durable:
+                    os.fsync(handle.fileno())
             temporary.chmod(0o666 & ~_umask())
-            return _linked(temporary, path, content)
+            made = _linked(temporary, path, content)
+            if made and durable:
+                fsync_directory(path.parent)
+            return made
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -180,7 +188,6 @@ def _linked(temporary: Path, path: Path, content: bytes) -> bool:
                 handle.write(content)
         except FileExistsError:
             return False
-    fsync_directory(path.parent)
     return True
 
 

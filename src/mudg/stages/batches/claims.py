@@ -65,7 +65,8 @@ class Claim:
     counts: dict[int, int]
     lost: threading.Event = field(default_factory=threading.Event)
 
-    def _file(self, attempt: int) -> Location:
+    def file(self, attempt: int) -> Location:
+        """The file of an attempt at the key."""
         return self.folder / f"{self.key}.{attempt}.json"
 
     def content(self, state: str, until: float) -> bytes:
@@ -78,22 +79,22 @@ class Claim:
 
     def renew(self) -> bool:
         """Prolong the lease; False, and ``lost`` set, when somebody else has taken over."""
-        if self.lost.is_set() or self._file(self.attempt + 1).exists():
+        if self.lost.is_set() or self.file(self.attempt + 1).exists():
             self.lost.set()
             return False
-        self._file(self.attempt).save(self.content(WORKING, time.time() + self.lease_s))
+        self.file(self.attempt).save(self.content(WORKING, time.time() + self.lease_s))
         return True
 
     def give_back(self, code: int, until: float) -> None:
         """End the attempt with a failure that is to be tried again, not before ``until``."""
         self.counts[code] = self.counts.get(code, 0) + 1
-        if not self._file(self.attempt + 1).exists():
-            self._file(self.attempt).save(self.content(WAITING, until))
+        if not self.file(self.attempt + 1).exists():
+            self.file(self.attempt).save(self.content(WAITING, until))
 
     def close(self) -> None:
         """Remove all files of the key: its end is on record."""
         for attempt in range(1, self.attempt + 1):
-            self._file(attempt).remove()
+            self.file(attempt).remove()
 
 
 def take(folder: Location, key: str, owner: Owner, lease_s: float) -> Claim | Busy:
@@ -117,8 +118,12 @@ def take(folder: Location, key: str, owner: Owner, lease_s: float) -> Claim | Bu
         if last.get("state") != WAITING:
             counts[retries.LOST] = counts.get(retries.LOST, 0) + 1
     claim = Claim(folder, key, attempt + 1, owner, lease_s, counts)
-    made = claim._file(attempt + 1).save(claim.content(WORKING, time.time() + lease_s), only_if_absent=True)
-    return claim if made else Busy(lease_s)
+    return claim if _created(claim.file(attempt + 1), claim.content(WORKING, time.time() + lease_s)) else Busy(lease_s)
+
+
+def _created(file: Location, content: bytes) -> bool:
+    """Create a claim; False if somebody else did. It need not survive a crash of the machine, as its owner does not."""
+    return file.save(content, only_if_absent=True) if file.local is None else store.create_once(file.local, content, durable=False)
 
 
 def _longer_here(counts: Mapping[int, int]) -> float:

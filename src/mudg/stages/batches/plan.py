@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -113,10 +114,15 @@ class BatchPlan:
             yield unit
 
 
+@functools.cache
+def _version() -> str:
+    return version()
+
+
 def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
     """Content key: of the log's identity, settings, version and the keys of what is read."""
     values = [
-        RULES_VERSION, version(), stage.name, list(stage.words), without_devices(stage.settings), entry.name, entry.source,
+        RULES_VERSION, _version(), stage.name, list(stage.words), without_devices(stage.settings), entry.name, entry.source,
         dict(entry.settings), dict(needs),
     ]  # fmt: skip
     return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]

@@ -116,7 +116,7 @@ class BatchStatus:
         """Reasons of failures with their number and an example, the most frequent first."""
         groups: Counter[tuple[int, str]] = Counter()
         example: dict[tuple[int, str], StepFailure] = {}
-        for failure in self.failures.values():
+        for failure in sorted(self.failures.values(), key=lambda one: one.scene):
             group = (failure.code, failure.words.split(";")[0][:80])
             groups[group] += 1
             example.setdefault(group, failure)
