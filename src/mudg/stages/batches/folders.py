@@ -83,9 +83,8 @@ class BatchFolder:
         """
         file, record = self.own / "plan.json", plan.record()
         record = json.loads(store.json_text(record))
-        if not file.exists() and self.out.local is not None and self.out.local.is_dir() and any(
-            not name.startswith(".") for name in self.out.names()
-        ):
+        names = [name for name in self.out.names() if not name.startswith(".")] if self.out.local is not None else []
+        if names and BOOKKEEPING not in names:  # another worker may begin at the same moment
             raise UsageError("the output holds files of something else", where=str(self.out), remedy="choose an empty --out")
         if not file.save((store.json_text(record) + "\n").encode(), only_if_absent=True):
             before = store.parse_json(file.load(), str(file))
