@@ -76,7 +76,6 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
     host = socket.gethostname().split(".")[0]
     text = CONF.format(host=host, folder=folder, user="root", port=_free_port(), node_port=_free_port(), cores=os.cpu_count())
     (folder / "slurm.conf").write_text(text)
-    (folder / "cgroup.conf").write_text("CgroupPlugin=disabled\n")
     environment = {**os.environ, "SLURM_CONF": str(folder / "slurm.conf")}
     commands = (
         ["munged", "--foreground", "--force", f"--key-file={folder}/munge.key", f"--socket={folder}/munge.socket",
@@ -87,8 +86,8 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
     running: list[subprocess.Popen[bytes]] = []
     try:
         for words in commands:
-            log = (folder / f"{words[0]}.out").open("wb")
-            running.append(subprocess.Popen([_program(words[0]) or words[0], *words[1:]], env=environment, stdout=log, stderr=log))
+            with (folder / f"{words[0]}.out").open("wb") as log:
+                running.append(subprocess.Popen([_program(words[0]) or words[0], *words[1:]], env=environment, stdout=log, stderr=log))
             time.sleep(1.0)
         end = time.monotonic() + 60
         while "idle" not in subprocess.run(["sinfo", "-h", "-o", "%t"], env=environment, capture_output=True, text=True).stdout:

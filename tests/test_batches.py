@@ -505,3 +505,66 @@ def test_paths_in_settings_are_made_absolute(tmp_path: Path, monkeypatch: pytest
     plan = batch.plan_for(BatchConfig(stages=("ingest", "annotate")), settings)
     assert plan.stages[1].settings["weights"] == str(tmp_path / "models/net")
     assert batch.plan_for(BatchConfig(), RunConfig()).stages[0].name == "run"
+
+
+# ---- templates for schedulers -------------------------------------------------------------------------------------------
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "docs/examples"
+ANY = object()
+KUBERNETES = {
+    "apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": str},
+    "spec": {
+        "completionMode": "Indexed", "completions": int, "parallelism": int, "backoffLimitPerIndex": int, "maxFailedIndexes": int,
+        "podFailurePolicy": {"rules": [{"action": str, "onExitCodes?": {"containerName": str, "operator": str, "values": [int]},
+                                        "onPodConditions?": [{"type": str}]}]},
+        "template": {"spec": {
+            "restartPolicy": "Never", "terminationGracePeriodSeconds": int, "serviceAccountName": str,
+            "containers": [{"name": str, "image": str, "command": [str], "args": [str], "resources": {"requests": ANY, "limits": ANY},
+                            "volumeMounts": [{"name": str, "mountPath": str}]}],
+            "volumes": [{"name": str, "emptyDir": {}}],
+        }},
+    },
+}  # fmt: skip
+SKYPILOT = {
+    "name": str, "num_nodes": int, "envs": {"LIST": str, "OUT": str}, "setup": str, "run": str,
+    "resources": {"cpus": str, "memory": str, "disk_size": int, "use_spot": bool,
+                  "job_recovery": {"strategy": str, "max_restarts_on_errors": int}},
+}  # fmt: skip
+
+
+def differs(found: object, schema: object, at: str = "") -> list[str]:
+    """What in a value does not follow a schema: mappings with these keys (? = may be absent), lists of these, types, or values."""
+    if schema is ANY:
+        return []
+    if isinstance(schema, type):
+        return [] if type(found) is schema else [f"{at}: {found!r}"]
+    if isinstance(schema, list):
+        return [p for i, one in enumerate(found) for p in differs(one, schema[0], f"{at}[{i}]")] if isinstance(found, list) else [at]
+    if isinstance(schema, dict):
+        if not isinstance(found, dict):
+            return [at]
+        known = {name.rstrip("?"): (name.endswith("?"), inner) for name, inner in schema.items()}
+        wrong = [f"{at}.{name}" for name in found if name not in known]
+        wrong += [f"{at}.{name} is missing" for name, (optional, _) in known.items() if not optional and name not in found]
+        return wrong + [p for name, inner in found.items() if name in known for p in differs(inner, known[name][1], f"{at}.{name}")]
+    return [] if found == schema else [f"{at}: {found!r}"]
+
+
+def test_templates_follow_their_schemas_and_start_a_batch() -> None:
+    import yaml
+
+    job = yaml.safe_load((EXAMPLES / "batch_kubernetes.yaml").read_text())
+    assert differs(job, KUBERNETES) == []
+    spec = job["spec"]
+    pod, (container,) = spec["template"]["spec"], spec["template"]["spec"]["containers"]
+    words = [*container["command"], *container["args"]]
+    parsed = cli.parse(words[1:])
+    assert parsed.settings.engine == "env" and parsed.settings.shards == spec["completions"]
+    assert pod["terminationGracePeriodSeconds"] > parsed.settings.grace_s
+    assert {rule["onExitCodes"]["containerName"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule} == {container["name"]}
+    assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
+    task = yaml.safe_load((EXAMPLES / "batch_skypilot.yaml").read_text())
+    assert differs(task, SKYPILOT) == []
+    line = next(line for line in task["run"].splitlines() if line.startswith("mudg"))
+    assert cli.parse(line.split()[1:]).settings.engine == "env"
+    assert differs({"a": 1, "c": "x"}, {"a": str, "b": int}) == [".c", ".b is missing", ".a: 1"]
