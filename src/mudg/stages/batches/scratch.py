@@ -183,20 +183,25 @@ class DirectFolder(WorkFolder):
 
     @property
     def result(self) -> Path:
+        """The folder right below the output."""
         return self._result
 
     def adopted(self) -> Path | None:
+        """Nothing: the verb itself reuses what is finished."""
         return None
 
     def prepare(self) -> None:
+        """Write the settings."""
         store.make_folder(self.path)
         self._write_settings()
 
     def command(self) -> list[str]:
+        """The command line, to be run where this program runs."""
         source = self._unit.entry.source
         return command_of(self._unit, {"source": source}, str(self.result), str(self.path / SETTINGS))
 
     def replacing(self) -> list[str] | None:
+        """The same with --overwrite, where an unfinished result lies."""
         words = self.command()
         try:
             unfinished = store.read_json(self.result / store.RUN_STATE)["state"] in ("running", "interrupted")
@@ -205,9 +210,10 @@ class DirectFolder(WorkFolder):
         return [*words, "--overwrite"] if unfinished and "--overwrite" not in words else None
 
     def publish(self) -> None:
-        pass
+        """Nothing: it is there already."""
 
     def leave(self, stopped: bool) -> None:
+        """The verb resumes in its own folder."""
         self.remove()
 
 

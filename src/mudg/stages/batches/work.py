@@ -350,7 +350,8 @@ class Worker:
     def _after_failure(self, unit: Unit, claim: claims.Claim, work: WorkFolder, ending: Ending) -> str:
         rule = retries.rule_of(ending.code)
         times = claim.counts.get(ending.code, 0) + 1
-        if rule.fresh or (rule.elsewhere and not work.in_output):  # a scratch disk that is full must not stay so
+        useless = rule.fresh or rule.tries == 1  # of a log that is going to be repaired, or of settings that nobody wants
+        if useless or (rule.elsewhere and not work.in_output):  # a scratch disk that is full must not stay so
             work.remove()
         else:
             with contextlib.suppress(MudgError, OSError):

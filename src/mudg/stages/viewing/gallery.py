@@ -55,6 +55,6 @@ def _folders(runs: Sequence[Path]) -> list[Path]:
     for given in map(Path, runs):
         own = any((given / name).is_file() for name in (store.RUN_STATE, "bench.json"))
         below = [] if own or not given.is_dir() else sorted(given.iterdir())
-        inside = [one for one in below if one.is_dir() and not one.name.startswith(".")]
+        inside = [one for one in below if one.is_dir() and not one.name.startswith((".", "_"))]
         found += [one for one in (inside or [given]) if one.resolve() not in {known.resolve() for known in found}]
     return found
