@@ -38,7 +38,8 @@ def run_shard(words: Sequence[str], folder: str, index: int) -> int:
 
     with processes.life_line() as line:
         variables: Mapping[str, str] = {**os.environ, **environment_of(index), processes.LIFE_LINE: str(line)}
-        return subprocess.run(list(words), cwd=folder if os.path.isdir(folder) else None, env=dict(variables), pass_fds=(line,), check=False).returncode
+        here = folder if os.path.isdir(folder) else None
+        return subprocess.run(list(words), cwd=here, env=dict(variables), pass_fds=(line,), check=False).returncode
 
 
 class RayTasks:
@@ -59,9 +60,9 @@ class RayTasks:
         if not self._ray.is_initialized():
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
             self._ray.init(address=self._job.address or None, log_to_driver=True, logging_level="warning")
-        task = self._ray.remote(run_shard).options(
+        task = self._ray.remote(
             num_cpus=self._job.cores, num_gpus=self._job.gpus, max_retries=_RETRIES, scheduling_strategy="SPREAD", max_calls=1
-        )
+        )(run_shard)
         self._waiting = [task.remote(self._job.words, self._job.folder, index) for index in range(self._job.shards)]
         return str(self._job.address or "local")
 
