@@ -215,9 +215,11 @@ def test_the_page_moves_objects_as_the_program_does(
     assert opened.errors == []
 
 
-PRESS = "(type, x, y, id = 1) => document.getElementById('stage').dispatchEvent(new PointerEvent(type, {clientX: x, clientY: y, pointerId: id, bubbles: true}))"
+PRESS = """(type, x, y, id = 1) => document.getElementById('stage').dispatchEvent(
+  new PointerEvent(type, {clientX: x, clientY: y, pointerId: id, bubbles: true}))"""
 HANDLES = """(() => { const app = window.mudg, {view, area, ratio} = app.last, box = app.stage.getBoundingClientRect(), found = {};
-  for (const [name, [x, y]] of Object.entries(app.gizmo.handles(view, app.gizmo.frame()))) found[name] = [box.left + (x + area[0]) / ratio, box.top + (y + area[1]) / ratio];
+  for (const [name, [x, y]] of Object.entries(app.gizmo.handles(view, app.gizmo.frame())))
+    found[name] = [box.left + (x + area[0]) / ratio, box.top + (y + area[1]) / ratio];
   return found; })()"""
 
 

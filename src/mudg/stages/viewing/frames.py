@@ -25,7 +25,8 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class FrameRequest(StrictRecord):
-    """One frame, as ``assets/viewer/exact.js`` asks for it. ``axes``: the camera's right, down and ahead in the world. ``edits``: a script."""
+    """One frame, as ``assets/viewer/exact.js`` asks for it. ``axes``: the camera's right, down and ahead in the world. ``edits``: a
+    script."""
 
     scene: Annotated[int, Field(ge=0)]
     layer: Literal["color", "depth", "class"]

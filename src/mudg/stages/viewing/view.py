@@ -4,7 +4,7 @@ frames where the camera rests. The page is ``assets/viewer``; what it is made of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
@@ -180,7 +180,12 @@ def budget_text(page: ViewerPage, data: dict[str, bytes], out: Path) -> str:
 
 
 def run_view(
-    config: ViewConfig, run: Path, compare: Path | None = None, *, scene: Path | None = None, files: EditFiles | None = None
+    config: ViewConfig,
+    run: Path,
+    compare: Path | None = None,
+    *,
+    scene: Path | None = None,
+    files: EditFiles | None = None,
 ) -> dict[str, Any]:
     """Serve the page of a run until it is interrupted.
 
@@ -190,7 +195,7 @@ def run_view(
     Raises:
         UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As ``run_page``.
     """
-    server, site = server_of(config, run, compare, scene, files or EditFiles())
+    server, site = server_of(config, run, compare, scene, files)
     address = address_of(server, site)
     log.info(f"viewer: {address}   (Ctrl-C ends it)")
     show(address, server.server_address[1], config.browser)
@@ -204,22 +209,24 @@ def run_view(
 
 
 def server_of(
-    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None, edits: EditFiles = EditFiles()
+    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None, files: EditFiles | None = None
 ) -> tuple[ThreadingHTTPServer, Site]:
     """The server of a run's page, listening, and what it serves."""
     token = token_for(config.host, config.token)
     shown = find_shown(config, run, scene, compare)
     layers = list(LAYERS) if config.exact else []
-    desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), edits)
-    page = page_of(config, shown, live={"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name})
+    desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
+    page = page_of(
+        config, shown, live={"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name}
+    )
     made = page.folder(*page.build())
-    files = {"" if name == "index.html" else name: content for name, content in made.items()}
+    served = {"" if name == "index.html" else name: content for name, content in made.items()}
     report = Path(run) / "report.html"
     if report.is_file():
-        files["report.html"] = store.read_bytes(report)
+        served["report.html"] = store.read_bytes(report)
     answers: dict[str, Answer] = {"edits": lambda asked: desk.answer(parse_record(EditRequest, asked, "request"))}
     if config.exact:
         source = FrameSource(desk.edited, config.width_px, drawing_device(config.device, "view"))
         answers["frame"] = lambda asked: (source.png(parse_record(FrameRequest, asked, "request")), "image/png")
-    site = Site(files, answers, token)
+    site = Site(served, answers, token)
     return open_server(site, config.host, config.port), site
