@@ -47,6 +47,8 @@ class LocalStore:
 
     def piece(self, path: str, begin: int, end: int) -> bytes:
         """Bytes ``begin`` to ``end`` (exclusive) of a file."""
+        if not os.path.lexists(path):
+            raise FileNotFoundError(path)
         with store.open_file(Path(path)) as handle:
             handle.seek(begin)
             return handle.read(end - begin)

@@ -43,7 +43,7 @@ class Location:
             return given
         text = given.as_posix() if isinstance(given, Path) else str(given)
         if isinstance(given, Path) and _FLATTENED.match(text):  # what Path makes of s3://bucket
-            text = text.replace(":/", "://", 1)
+            text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
         scheme = scheme_of(text)
         if not text:
             raise UsageError("no path or address was given")

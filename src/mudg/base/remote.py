@@ -63,9 +63,9 @@ def checked_address(text: str) -> str:
     if scheme not in PACKAGES:
         raise UsageError("no storage of this kind is known", where=f"{scheme}://", expected=f"a path, or one of {_listed()}")
     head, _, tail = rest.partition("/")
-    user, at, host = head.rpartition("@")
-    if at and (scheme not in _WITH_ACCOUNT or ":" in user):
-        raise UsageError("an address holds a user or a password", where=f"{scheme}://...@{host}/...", remedy="leave them out and set "
+    at = "@" in head
+    if (at and scheme not in _WITH_ACCOUNT) or ":" in head:  # a password may hold a slash
+        raise UsageError("an address holds a user or a password", where=f"{scheme}://...", remedy="leave them out and set "
             "the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")  # fmt: skip
     if "?" in rest:
         raise UsageError("an address holds a query, which may be a secret", where=f"{scheme}://{head.partition('?')[0]}/...",
