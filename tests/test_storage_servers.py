@@ -129,7 +129,7 @@ def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path
     assert not (root / "run/manifest.json").exists(), "it was killed too late to show anything"
     with pytest.raises(InputError, match="not finished"):
         (root / "run").fetch(tmp_path / "half")
-    there = {name for name in (root / "run/part0").names()}
+    there = set((root / "run/part0").names())
     assert there
     sent: list[str] = []
     put = remote.RemoteStore.put

