@@ -143,7 +143,7 @@ def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path
 
 
 def test_uploads_that_fail_now_and_then_arrive(root: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every third request of the client is answered with a failure that passes."""
+    """Every seventh request of the client is answered with a failure that passes."""
     monkeypatch.setattr(remote, "FIRST_WAIT_S", 0.01)
     files = type(root.side.storage.files)
     found, lock, count = files._call_s3, threading.Lock(), [0]
@@ -152,7 +152,7 @@ def test_uploads_that_fail_now_and_then_arrive(root: Location, tmp_path: Path, m
         with lock:
             count[0] += 1
             number = count[0]
-        if number % 3 == 0:
+        if number % 7 == 0:
             raise ConnectionResetError("injected")
         return await found(self, *args, **options)
 
