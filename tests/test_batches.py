@@ -561,7 +561,8 @@ def test_templates_follow_their_schemas_and_start_a_batch() -> None:
     parsed = cli.parse(words[1:])
     assert parsed.settings.engine == "env" and parsed.settings.shards == spec["completions"]
     assert pod["terminationGracePeriodSeconds"] > parsed.settings.grace_s
-    assert {rule["onExitCodes"]["containerName"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule} == {container["name"]}
+    rules = [rule["onExitCodes"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule]
+    assert {rule["containerName"] for rule in rules} == {container["name"]}
     assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
     task = yaml.safe_load((EXAMPLES / "batch_skypilot.yaml").read_text())
     assert differs(task, SKYPILOT) == []

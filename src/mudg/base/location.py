@@ -13,80 +13,16 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from mudg.base import store, transfer
 from mudg.base.errors import InputError, UsageError
-from mudg.base.remote import PACKAGES, Found, RemoteStore, checked_address, missing, scheme_of
+from mudg.base.local import LocalStore
+from mudg.base.remote import PACKAGES, PROBE, RemoteStore, checked_address, scheme_of
+from mudg.base.run_folder import is_temporary
 
-_TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}\.part(\..*)?|\.mudg-probe-[0-9a-f]+")
 _FLATTENED = re.compile(rf"({'|'.join(PACKAGES)}|file):/(?!/)")
-
-
-class LocalStore:
-    """Folders of this machine, asked in the same way as an object store."""
-
-    def where(self, path: str) -> str:
-        """The path, for messages."""
-        return path
-
-    def exists(self, path: str) -> bool:
-        """Whether a file or folder is there."""
-        return os.path.exists(path)
-
-    def is_folder(self, path: str) -> bool:
-        """Whether a folder is there."""
-        return os.path.isdir(path)
-
-    def size(self, path: str) -> int:
-        """Bytes of a file."""
-        return os.stat(path).st_size
-
-    def load(self, path: str) -> bytes:
-        """The content of a file."""
-        return store.read_bytes(Path(path))
-
-    def piece(self, path: str, begin: int, end: int) -> bytes:
-        """Bytes ``begin`` to ``end`` (exclusive) of a file."""
-        with store.open_file(Path(path)) as handle:
-            handle.seek(begin)
-            return handle.read(end - begin)
-
-    def save(self, path: str, data: bytes) -> None:
-        """Write a file, over one that is there."""
-        store.atomic_write(Path(path), data)
-
-    def create(self, path: str, data: bytes) -> bool:
-        """Write a file where none is; False if one is there."""
-        return store.create_once(Path(path), data)
-
-    def exclusive(self, path: str) -> bool:
-        """Of several that create the same name at once, one succeeds."""
-        return True
-
-    def remove(self, path: str) -> None:
-        """Remove a file; none there is no error."""
-        with store.disk_errors("cannot remove a file", Path(path), "check who may write there"):
-            Path(path).unlink(missing_ok=True)
-
-    def names(self, path: str) -> list[str]:
-        """Names right below."""
-        return os.listdir(path) if os.path.isdir(path) else []
-
-    def tree(self, path: str) -> dict[str, Found]:
-        """Every file below, by its name relative to ``path``."""
-        return {name: Found((Path(path) / name).stat().st_size) for name in transfer.files_below(Path(path))}
-
-    def note(self, path: str, name: str) -> str:
-        """Files carry no notes."""
-        return ""
-
-    def put(self, path: str, file: Path, sha256: str) -> None:
-        """Copy a file there."""
-        with store.atomic_path(Path(path)) as temporary, store.disk_errors("copying failed", Path(path), "free disk space"):
-            shutil.copyfile(file, temporary)
 
 
 @dataclass(frozen=True)
@@ -105,9 +41,9 @@ class Location:
         """
         if isinstance(given, Location):
             return given
-        text = str(given)
+        text = given.as_posix() if isinstance(given, Path) else str(given)
         if isinstance(given, Path) and _FLATTENED.match(text):  # what Path makes of s3://bucket
-            text = text.replace(":/", "://", 1)
+            text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
         scheme = scheme_of(text)
         if not text:
             raise UsageError("no path or address was given")
@@ -164,14 +100,17 @@ class Location:
         try:
             return self._store.size(self._path)
         except FileNotFoundError as error:
-            raise missing(self.text) from error
+            raise self._missing() from error
 
     def load(self) -> bytes:
         """The content of a file. InputError: none is there."""
         try:
             return self._store.load(self._path)
         except (FileNotFoundError, IsADirectoryError) as error:
-            raise missing(self.text) from error
+            raise self._missing() from error
+
+    def _missing(self) -> InputError:
+        return InputError("nothing is at this address", where=self.text, remedy="check it, and whether its upload was finished")
 
     def save(self, data: bytes, *, only_if_absent: bool = False) -> bool:
         """Write a file completely or not at all.
@@ -199,17 +138,13 @@ class Location:
             return
         if "/" not in self._path.strip("/"):
             raise UsageError("a whole bucket or disk is not removed", where=self.text)
-        if self.local is not None:
-            at.remove(f"{self._path}/{store.MANIFEST}")
-            with store.disk_errors("cannot remove a folder", self.local, "check who may write there"):
-                shutil.rmtree(self.local)
-            return
-        for name in sorted(at.tree(self._path), key=lambda one: one != store.MANIFEST):
-            at.remove(f"{self._path}/{name}")
+        at.remove(f"{self._path}/{store.MANIFEST}")
+        at.remove_tree(self._path)
 
     def names(self) -> list[str]:
         """Names of what lies right below, sorted, without temporary files; empty where nothing is."""
-        return sorted(name for name in self._store.names(self._path) if not _TEMPORARY.fullmatch(name))
+        found = self._store.names(self._path)
+        return sorted(name for name in found if not is_temporary(name) and not name.startswith(PROBE))
 
     def fetch(self, to: Path) -> None:
         """Stage a file or folder in. What an earlier, interrupted fetch left at ``to`` is used again.
@@ -219,9 +154,7 @@ class Location:
             ResourceError: no connection, or the disk is full.
         """
         if not self.exists():
-            raise missing(self.text)
-        if self.local is not None and self.local.is_file():
-            store.regular(self.local)
+            raise self._missing()
         transfer.fetch(self.side, Path(to))
 
     def push(self, frm: Path) -> None:

@@ -6,6 +6,7 @@ come from the environment, where the store's own package looks for them; an addr
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import errno
 import functools
@@ -36,7 +37,8 @@ PIECE: Final = 8 << 20
 """Bytes of one request; what a transfer holds in memory for each file that is under way."""
 _PARTS: Final = 9000
 """An object may be put together of 10,000 parts."""
-_PROBE: Final = ".mudg-probe-"
+PROBE: Final = ".mudg-probe-"
+"""What the names of objects begin with that try out a store."""
 _WITH_ACCOUNT: Final = frozenset({"abfs", "abfss", "az"})
 """Schemes in which a name before ``@`` is the container."""
 
@@ -61,9 +63,9 @@ def checked_address(text: str) -> str:
     if scheme not in PACKAGES:
         raise UsageError("no storage of this kind is known", where=f"{scheme}://", expected=f"a path, or one of {_listed()}")
     head, _, tail = rest.partition("/")
-    user, at, host = head.rpartition("@")
-    if at and (scheme not in _WITH_ACCOUNT or ":" in user):
-        raise UsageError("an address holds a user or a password", where=f"{scheme}://...@{host}/...", remedy="leave them out and set "
+    at = "@" in head
+    if (at and scheme not in _WITH_ACCOUNT) or ":" in head:  # a password may hold a slash
+        raise UsageError("an address holds a user or a password", where=f"{scheme}://...", remedy="leave them out and set "
             "the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")  # fmt: skip
     if "?" in rest:
         raise UsageError("an address holds a query, which may be a secret", where=f"{scheme}://{head.partition('?')[0]}/...",
@@ -218,10 +220,15 @@ def _pause_s(tries: int) -> float:
 
 @dataclass(frozen=True)
 class Found:
-    """A file in a store. md5: of its content, where the listing names it; else empty."""
+    """A file in a store. tag: its md5, or that of its parts as S3 writes it (``...-3``), where the listing has it; else empty."""
 
     size: int
-    md5: str = ""
+    tag: str = ""
+
+
+def part_bytes(size: int) -> int:
+    """Bytes of each part in which an object of ``size`` bytes is uploaded; all in one below twice that."""
+    return max(PIECE, -(-size // _PARTS))
 
 
 _exclusive: dict[tuple[str, str], bool] = {}
@@ -275,7 +282,7 @@ class RemoteStore:
 
     def save(self, path: str, data: bytes) -> None:
         """Put an object, over one that is there."""
-        self._ask("writing", path, self.files.pipe_file, path, data)
+        self._put(path, self.files.pipe_file, path, data)
 
     def create(self, path: str, data: bytes) -> bool:
         """Put an object where none is; False if one is there. Two that do so at once: one succeeds, if ``exclusive`` holds."""
@@ -302,6 +309,8 @@ class RemoteStore:
                 repeated(put, "writing", self.where(path))
         except FileExistsError:  # an answer that was lost on the way was repeated: is it this one that is there?
             return tries > 1 and self.note(path, "mudg-writer") == token
+        except FileNotFoundError as error:
+            raise _no_bucket(self.where(path), error) from error
         return True
 
     @property
@@ -328,13 +337,15 @@ class RemoteStore:
         return _exclusive[self.scheme, bucket]
 
     def _probe(self, path: str) -> bool:
-        probe = f"{path.rpartition('/')[0]}/{_PROBE}{hashlib.sha256(os.urandom(16)).hexdigest()[:16]}"
+        probe = f"{path.rpartition('/')[0]}/{PROBE}{hashlib.sha256(os.urandom(16)).hexdigest()[:16]}"
         held = False
         try:
             for _ in range(2):
                 self._ask("trying out conditional writes", probe, self.files.pipe_file, probe, b"probe", mode="create")
         except FileExistsError:
             held = True
+        except FileNotFoundError as error:
+            raise _no_bucket(self.where(path), error) from error
         except (TypeError, ValueError, NotImplementedError):
             held = False  # its package knows no conditional writes
         finally:
@@ -349,6 +360,20 @@ class RemoteStore:
         """Remove an object; none there is no error."""
         with contextlib.suppress(FileNotFoundError):
             self._ask("removing", path, self.files.rm_file, path)
+        if self.scheme == "memory":
+            self._prune(path)
+
+    def _prune(self, path: str) -> None:
+        """An emptied folder is none, as in real stores; fsspec's memory keeps it."""
+        at, folders = f"/{path}".rpartition("/")[0], self.files.pseudo_dirs
+        while at in folders and not self.files.ls(at):
+            folders.remove(at)
+            at = at.rpartition("/")[0]
+
+    def remove_tree(self, path: str) -> None:
+        """Remove every object below."""
+        for name in self.tree(path):
+            self.remove(f"{path}/{name}")
 
     def names(self, path: str) -> list[str]:
         """Names right below."""
@@ -369,7 +394,7 @@ class RemoteStore:
         head = path.strip("/") + "/"
         below = {str(name).strip("/"): facts for name, facts in found.items()}
         return {
-            name[len(head) :]: Found(int(facts.get("size") or 0), _md5_of(facts))
+            name[len(head) :]: Found(int(facts.get("size") or 0), _tag_of(facts))
             for name, facts in sorted(below.items())
             if name.startswith(head) and len(name) > len(head)
         }
@@ -378,15 +403,26 @@ class RemoteStore:
         """Upload a file, in parts where it is large. ResourceError if that fails."""
         options: dict[str, Any] = {}
         if self._keeps_notes:
-            options = {"Metadata": {"sha256": sha256}, "chunksize": max(PIECE, -(-file.stat().st_size // _PARTS))}
-        self._ask("writing", path, self.files.put_file, str(file), path, **options)
+            options = {"Metadata": {"sha256": sha256}, "chunksize": part_bytes(file.stat().st_size)}
+        self._put(path, self.files.put_file, str(file), path, **options)
+
+    def _put(self, path: str, call: Callable[..., Any], *args: Any, **options: Any) -> None:
+        try:
+            self._ask("writing", path, call, *args, **options)
+        except FileNotFoundError as error:
+            raise _no_bucket(self.where(path), error) from error
+
+    def settle(self, path: str) -> None:
+        """Wait until what was written is kept. A store answers only then."""
 
 
-def _md5_of(facts: Mapping[str, Any]) -> str:
+def _tag_of(facts: Mapping[str, Any]) -> str:
+    if isinstance(facts.get("md5Hash"), str):  # Google Cloud
+        return base64.b64decode(facts["md5Hash"]).hex()
     tag = str(facts.get("ETag") or "").strip('"')
-    return tag if re.fullmatch(r"[0-9a-f]{32}", tag) else ""
+    return tag if re.fullmatch(r"[0-9a-f]{32}(-\d+)?", tag) else ""
 
 
-def missing(where: str) -> InputError:
-    """The error for an address at which nothing is."""
-    return InputError("nothing is at this address", where=where, remedy="check the address, and whether its upload was finished")
+def _no_bucket(where: str, error: BaseException) -> InputError:
+    return InputError("there is no such bucket, or it is not reachable for this account", where=where,
+        got=without_secrets(str(error))[:200], remedy="make the bucket first; no bucket is made here")  # fmt: skip

@@ -131,6 +131,13 @@ def write_in_tree(path: Path, content: bytes) -> None:
         Path(path).write_bytes(content)
 
 
+def copy_in_tree(source: Path, path: Path) -> None:
+    """``write_in_tree`` of another file's content."""
+    make_folder(path.parent)
+    with _writing(path):
+        shutil.copyfile(source, path)
+
+
 def sync_tree(folder: Path) -> None:
     """Wait until every file below ``folder`` is on the disk.
 
@@ -213,6 +220,12 @@ def take_place(temporary: Path, path: Path) -> None:
     with _writing(path):
         temporary.replace(path)
         fsync_directory(path.parent)
+
+
+def remove(path: Path) -> None:
+    """Remove a file; none there is no error."""
+    with disk_errors("cannot remove a file", path, "check who may write there"):
+        Path(path).unlink(missing_ok=True)
 
 
 def blocks_of(path: Path) -> Iterator[bytes]:

@@ -1,4 +1,8 @@
-"""Folders from one place to another: verified, resumable, several files at a time, in bounded memory."""
+"""Folders from one place to another: verified, resumable, several files at a time, in bounded memory.
+
+An uploaded folder holds ``_contents.json`` beside its files: size and sha256 of each. It is written before anything else, in the state
+``uploading``, and once more when every file has arrived; the folder's ``manifest.json`` follows as the last file.
+"""
 
 from __future__ import annotations
 
@@ -7,47 +11,32 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from mudg.base import log, memory, store
-from mudg.base.errors import InputError, IntegrityError, ResourceError
-from mudg.base.remote import PIECE, Found
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.local import LocalStore, files_below
+from mudg.base.remote import PIECE, Found, RemoteStore, part_bytes
 
 CONTENTS: Final = "_contents.json"
-"""Beside an uploaded folder: size and sha256 of every file in it."""
 WORKERS: Final = 8
 """Files under way at once."""
-_SUFFIX: Final = ".fetch.part"
 _LEFT_FREE: Final = 64 << 20
-
-
-class Storage(Protocol):
-    """What a transfer asks of either side."""
-
-    def where(self, path: str) -> str: ...
-    def exists(self, path: str) -> bool: ...
-    def is_folder(self, path: str) -> bool: ...
-    def size(self, path: str) -> int: ...
-    def load(self, path: str) -> bytes: ...
-    def piece(self, path: str, begin: int, end: int) -> bytes: ...
-    def save(self, path: str, data: bytes) -> None: ...
-    def remove(self, path: str) -> None: ...
-    def tree(self, path: str) -> dict[str, Found]: ...
-    def note(self, path: str, name: str) -> str: ...
-    def put(self, path: str, file: Path, sha256: str) -> None: ...
+_LAST: Final = (store.MANIFEST, store.RUN_STATE)
+"""What says that a folder is finished is written after what it speaks of."""
 
 
 @dataclass(frozen=True)
 class Side:
-    """A folder or file in a storage."""
+    """A folder or file in a store."""
 
-    storage: Storage
+    storage: LocalStore | RemoteStore
     path: str
 
     def below(self, name: str) -> str:
-        """The storage's path of a file in the folder."""
+        """The store's path of a file in the folder."""
         return f"{self.path.rstrip('/')}/{name}" if name else self.path
 
     def where(self, name: str = "") -> str:
@@ -63,39 +52,43 @@ class Expected:
     sha256: str = ""
 
 
-# what is in a folder --------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Upload:
+    """What ``_contents.json`` says. names: of one under way: all that it or an earlier one may have written."""
+
+    complete: bool
+    files: Mapping[str, Expected] = field(default_factory=dict)
+    names: frozenset[str] = frozenset()
+
+    def content(self) -> bytes:
+        """The record as it is stored."""
+        files = {name: {"bytes": one.size, "sha256": one.sha256} for name, one in sorted(self.files.items())}
+        state = "complete" if self.complete else "uploading"
+        return store.json_text({"schema": 1, "state": state, "files": files, "names": sorted(self.names)}, indent=None).encode()
 
 
-def files_below(folder: Path) -> list[str]:
-    """Relative POSIX names of all regular files, sorted, without temporary ones and locks."""
-    names = []
-    for top, _, files in os.walk(folder):
-        for name in files:
-            path = Path(top) / name
-            relative = path.relative_to(folder).as_posix()
-            if name == "lock" or any(".part" in part for part in relative.split("/")) or not path.is_file():
-                continue
-            names.append(relative)
-    return sorted(names)
+def uploaded(side: Side) -> Upload | None:
+    """The record of an upload to this folder; None where there is none.
 
-
-def _contents(side: Side) -> dict[str, Expected] | None:
-    """What the record of an upload says; None where there is none."""
-    path = side.below(CONTENTS)
+    Raises:
+        IntegrityError: it is damaged.
+    """
+    path, where = side.below(CONTENTS), side.where(CONTENTS)
     if not side.storage.exists(path):
         return None
     try:
-        files = store.parse_json(side.storage.load(path), side.where(CONTENTS))["files"]
-        found = {str(name): Expected(int(entry["bytes"]), str(entry["sha256"])) for name, entry in files.items()}
+        record = store.parse_json(side.storage.load(path), where)
+        files = {str(name): Expected(int(entry["bytes"]), str(entry["sha256"])) for name, entry in record["files"].items()}
+        found = Upload(record["state"] == "complete", files, frozenset(map(str, record["names"])))
     except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise IntegrityError("the record of an upload is damaged", where=side.where(CONTENTS), got=str(error).split("\n")[0],
-            remedy="upload it again") from error  # fmt: skip
-    for name in found:
-        plain_name(name, side.where(CONTENTS))
+        raise IntegrityError("the record of an upload is damaged", where=where, got=str(error).split("\n")[0],
+            remedy="upload the folder again, to another address") from error  # fmt: skip
+    for name in (*found.files, *found.names):
+        _plain(name, where)
     return found
 
 
-def plain_name(name: str, where: str) -> str:
+def _plain(name: str, where: str) -> str:
     """A name that stays below its folder, or IntegrityError: what lies in a store may be anybody's."""
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or (os.name == "nt" and ":" in name):
@@ -106,77 +99,105 @@ def plain_name(name: str, where: str) -> str:
 # fetch ----------------------------------------------------------------------------------------------------------------
 
 
-def fetch(source: Side, to: Path) -> None:
-    """Copy a file or folder to ``to`` on this machine; see ``Location.fetch``."""
+def fetch(source: Side, to: Path) -> frozenset[str]:
+    """Copy a file or folder to ``to`` on this machine (see ``Location.fetch``); return the names of its files."""
     if not source.storage.is_folder(source.path):
         wanted = {"": Expected(source.storage.size(source.path))}
     else:
         wanted = _wanted(source)
-    _require_space(to, sum(one.size for one in wanted.values()), source)
-    last = [name for name in wanted if name == store.MANIFEST]
+    _require_space(to, wanted, source)
     store.make_folder(to.parent if "" in wanted else to)
-    for names in ([name for name in wanted if name not in last], last):
-        _all((_fetching(source, name, wanted[name], to) for name in names), f"fetching {source.where()}", len(names))
+    for last in (False, True):
+        names = [name for name in wanted if (PurePosixPath(name).name in _LAST) == last]
+        _all((_Fetching(source, name, wanted[name], to) for name in names), f"fetching {source.where()}", len(names))
+    return frozenset(wanted)
 
 
 def _wanted(source: Side) -> dict[str, Expected]:
-    found = _contents(source)
-    if found is not None:
-        if store.MANIFEST in found and not source.storage.exists(source.below(store.MANIFEST)):
-            raise InputError("an upload was not finished", where=source.where(), expected=store.MANIFEST,
+    record = uploaded(source)
+    if record is not None:
+        if not record.complete or (store.MANIFEST in record.files and not source.storage.exists(source.below(store.MANIFEST))):
+            raise InputError("an upload was not finished", where=source.where(),
                 remedy="repeat the command that makes it: it resumes")  # fmt: skip
-        return found
-    found = {plain_name(name, source.where()): Expected(facts.size) for name, facts in source.storage.tree(source.path).items()}
-    if store.MANIFEST in found:
-        where = source.where(store.MANIFEST)
-        listed = store.parse_json(source.storage.load(source.below(store.MANIFEST)), where)
-        files: Mapping[str, Any] = listed.get("files", {}) if isinstance(listed, dict) else {}
-        for name, entry in files.items():
-            if name not in found:
-                raise IntegrityError("a file is missing", where=source.where(name))
-            if isinstance(entry, dict) and "sha256" in entry:
-                found[name] = Expected(found[name].size, str(entry["sha256"]))
+        return dict(record.files)
+    there = source.storage.tree(source.path)
+    found = {_plain(name, source.where()): Expected(facts.size) for name, facts in there.items()}
+    for manifest in [name for name in found if PurePosixPath(name).name == store.MANIFEST]:
+        found.update(_listed(source, manifest, found))
     return found
 
 
-def _require_space(to: Path, count: int, source: Side) -> None:
-    at = next(one for one in (to, *to.absolute().parents) if one.exists())
+def _listed(source: Side, manifest: str, found: Mapping[str, Expected]) -> dict[str, Expected]:
+    """What a manifest in a folder that was put there by other means says of files beside it."""
+    record = store.parse_json(source.storage.load(source.below(manifest)), source.where(manifest))
+    files = record.get("files") if isinstance(record, dict) else None
+    listed: dict[str, Expected] = {}
+    for name, entry in (files if isinstance(files, dict) else {}).items():
+        full = str(PurePosixPath(manifest).parent / str(name))
+        if not isinstance(entry, dict) or "sha256" not in entry:
+            continue
+        if full not in found:
+            raise IntegrityError("a file is missing", where=source.where(full))
+        listed[full] = Expected(found[full].size, str(entry["sha256"]))
+    return listed
+
+
+def _require_space(to: Path, wanted: Mapping[str, Expected], source: Side) -> None:
+    """ResourceError if the disk cannot hold what is not yet there."""
+    missing = 0
+    for name, one in wanted.items():
+        there = next((at for at in (to / name, _part(to / name)) if at.is_file()), None)
+        missing += max(0, one.size - (there.stat().st_size if there else 0))
+    at = next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())
     free = shutil.disk_usage(at).free
-    if count + _LEFT_FREE > free:
-        raise ResourceError("not enough space to stage data in", where=str(to), expected=f"{memory.in_words(count)} for {source.where()}",
-            got=f"{memory.in_words(free)} free", remedy="free disk space, or choose a larger --scratch")  # fmt: skip
+    if missing + _LEFT_FREE > free:
+        raise ResourceError("not enough space to fetch data", where=str(to), expected=f"{memory.in_words(missing)} for {source.where()}",
+            got=f"{memory.in_words(free)} free", remedy="free disk space, or choose a folder on a larger disk (--scratch)")  # fmt: skip
 
 
-def _fetching(source: Side, name: str, expected: Expected, to: Path) -> Callable[[], None]:
-    return lambda: _fetch_file(source, name, expected, to / name if name else to)
+def _part(path: Path) -> Path:
+    return path.with_name(f".{path.name}.fetching.part")
 
 
-def _fetch_file(source: Side, name: str, expected: Expected, to: Path) -> None:
-    if to.is_file() and to.stat().st_size == expected.size and expected.sha256 and store.sha256_file(to) == expected.sha256:
-        return
-    part = to.with_name(f".{to.name}{_SUFFIX}")
-    digest, begin = hashlib.sha256(), 0
-    if part.is_file() and expected.sha256 and part.stat().st_size <= expected.size:
-        begin = part.stat().st_size
-        for block in store.blocks_of(part):
-            digest.update(block)
-    store.append_blocks(part, _pieces(source, name, expected, begin, digest), begin)
-    if expected.sha256 and digest.hexdigest() != expected.sha256:
-        part.unlink(missing_ok=True)
-        raise IntegrityError("what came is not what was uploaded", where=source.where(name), expected=f"sha256 {expected.sha256[:16]}...",
-            got=f"sha256 {digest.hexdigest()[:16]}...", remedy="repeat the command; if it fails again, upload the data again")  # fmt: skip
-    store.take_place(part, to)
+@dataclass(frozen=True)
+class _Fetching:
+    """One file on its way here."""
+
+    source: Side
+    name: str
+    expected: Expected
+    to: Path
+
+    def __call__(self) -> None:
+        path, wanted = (self.to / self.name if self.name else self.to), self.expected
+        if path.is_file() and path.stat().st_size == wanted.size and wanted.sha256 and store.sha256_file(path) == wanted.sha256:
+            return
+        part, digest, begin = _part(path), hashlib.sha256(), 0
+        if part.is_file() and wanted.sha256 and part.stat().st_size <= wanted.size:
+            begin = part.stat().st_size
+            for block in store.blocks_of(part):
+                digest.update(block)
+        store.append_blocks(part, _pieces(self.source, self.name, wanted.size, begin, digest), begin)
+        if wanted.sha256 and digest.hexdigest() != wanted.sha256:
+            store.remove(part)
+            if begin:  # the beginning, from an earlier try, may be of another version
+                return self()
+            raise IntegrityError("what came is not what was uploaded", where=self.source.where(self.name),
+                expected=f"sha256 {wanted.sha256[:16]}...", got=f"sha256 {digest.hexdigest()[:16]}...",
+                remedy="repeat the command; if it fails again, upload the data again")  # fmt: skip
+        store.take_place(part, path)
 
 
-def _pieces(source: Side, name: str, expected: Expected, begin: int, digest: Any) -> Iterator[bytes]:
-    while begin < expected.size:
-        end = min(begin + PIECE, expected.size)
+def _pieces(source: Side, name: str, size: int, begin: int, digest: Any) -> Iterator[bytes]:
+    while begin < size:
+        end = min(begin + PIECE, size)
         try:
             block = source.storage.piece(source.below(name), begin, end)
         except FileNotFoundError as error:
             raise IntegrityError("a file is missing", where=source.where(name)) from error
         if len(block) != end - begin:
-            raise IntegrityError("a file ended early", where=source.where(name), expected=f"{end} bytes", got=f"{begin + len(block)} bytes")
+            raise IntegrityError("a file has another size than it should", where=source.where(name), expected=f"{size} bytes",
+                got=f"{begin + len(block)} bytes")  # fmt: skip
         digest.update(block)
         yield block
         begin = end
@@ -185,74 +206,145 @@ def _pieces(source: Side, name: str, expected: Expected, begin: int, digest: Any
 # push -----------------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Digests:
+    """Of one file here. tag: what a store calls it if it arrives unchanged."""
+
+    expected: Expected
+    tag: str
+
+
 def push(folder: Path, target: Side) -> None:
     """Upload a folder; see ``Location.push``."""
     names = [name for name in files_below(folder) if name != CONTENTS]
-    there = target.storage.tree(target.path)
-    earlier = _contents(target) if CONTENTS in there else {}
-    for name in (store.MANIFEST, CONTENTS):  # from now on it is no result
-        if name in there and not (name == store.MANIFEST and _same_manifest(folder, target)):
-            target.storage.remove(target.below(name))
-    record: dict[str, dict[str, Any]] = {}
-    md5s: dict[str, str] = {}
-
-    def send(name: str) -> None:
-        file = folder / name
-        sha256, md5, size = _digests(file)
-        record[name], md5s[name] = {"bytes": size, "sha256": sha256}, md5
-        found, path = there.get(name), target.below(name)
-        if name != store.MANIFEST and found is not None and found.size == size and target.storage.note(path, "sha256") == sha256:
-            return
-        target.storage.put(path, file, sha256)
-
-    ordinary = [name for name in names if name != store.MANIFEST]
-    _all((lambda name=name: send(name) for name in ordinary), f"uploading to {target.where()}", len(ordinary))
-    stale = set(earlier or {}) - set(names)
-    _all((lambda name=name: target.storage.remove(target.below(name)) for name in stale), "removing", len(stale))
-    _verify(folder, target, record, md5s)
-    if store.MANIFEST in names:
-        sha256, _, size = _digests(folder / store.MANIFEST)
-        record[store.MANIFEST] = {"bytes": size, "sha256": sha256}
-    text = store.json_text({"schema": 1, "files": dict(sorted(record.items()))}, indent=None)
-    target.storage.save(target.below(CONTENTS), text.encode())
-    if store.MANIFEST in names:
-        target.storage.put(target.below(store.MANIFEST), folder / store.MANIFEST, record[store.MANIFEST]["sha256"])
+    there, earlier = target.storage.tree(target.path), uploaded(target)
+    if earlier is not None and earlier.complete and _is_there(folder, names, earlier, there):
+        return
+    foreign = sorted(set(names) & set(there)) if earlier is None else []
+    if foreign:
+        raise UsageError("the output address holds files of something else", where=target.where(), got=", ".join(foreign[:8]),
+            remedy="choose an address at which nothing is")  # fmt: skip
+    target.storage.remove(target.below(store.MANIFEST))  # from now on it is no result
+    own = frozenset((*earlier.files, *earlier.names) if earlier is not None else ())
+    target.storage.save(target.below(CONTENTS), Upload(False, names=own | frozenset(names)).content())
+    sent: dict[str, _Digests] = {}
+    for last in (False, True):
+        some = [name for name in names if name != store.MANIFEST and (PurePosixPath(name).name in _LAST) == last]
+        _all((_Sending(folder, name, target, there.get(name), sent) for name in some), f"uploading to {target.where()}", len(some))
+    stale = sorted(own - set(names))
+    _all((_Removing(target, name) for name in stale), "removing files of an earlier upload", len(stale))
+    _verify(target, sent)
+    target.storage.settle(target.path)
+    files = {name: one.expected for name, one in sent.items()}
+    if store.MANIFEST not in names:
+        target.storage.save(target.below(CONTENTS), Upload(True, files).content())
+        return
+    manifest = _digests(folder / store.MANIFEST).expected
+    target.storage.save(target.below(CONTENTS), Upload(True, {**files, store.MANIFEST: manifest}).content())
+    target.storage.save(target.below(store.MANIFEST), store.read_bytes(folder / store.MANIFEST))
 
 
-def _same_manifest(folder: Path, target: Side) -> bool:
-    return False
+def _is_there(folder: Path, names: list[str], earlier: Upload, there: Mapping[str, Found]) -> bool:
+    """Whether an earlier upload brought just this."""
+    if set(names) != set(earlier.files) or any(name not in there or there[name].size != earlier.files[name].size for name in names):
+        return False
+    return all(
+        (folder / name).stat().st_size == one.size and store.sha256_file(folder / name) == one.sha256
+        for name, one in earlier.files.items()
+    )
 
 
-def _digests(file: Path) -> tuple[str, str, int]:
-    sha256, md5, size = hashlib.sha256(), hashlib.md5(usedforsecurity=False), 0
+@dataclass(frozen=True)
+class _Sending:
+    """One file on its way there; ``sent`` receives what it was."""
+
+    folder: Path
+    name: str
+    target: Side
+    there: Found | None
+    sent: dict[str, _Digests]
+
+    def __call__(self) -> None:
+        file, path = self.folder / self.name, self.target.below(self.name)
+        digests = self.sent[self.name] = _digests(file)
+        wanted = digests.expected
+        same_size = self.there is not None and self.there.size == wanted.size
+        if not same_size or self.target.storage.note(path, "sha256") != wanted.sha256:
+            self.target.storage.put(path, file, wanted.sha256)
+
+
+@dataclass(frozen=True)
+class _Removing:
+    """One file that is no longer part of the folder."""
+
+    target: Side
+    name: str
+
+    def __call__(self) -> None:
+        self.target.storage.remove(self.target.below(self.name))
+
+
+def _digests(file: Path) -> _Digests:
+    size = file.stat().st_size
+    part = part_bytes(size)
+    sha256, parts = hashlib.sha256(), [hashlib.md5(usedforsecurity=False)]
+    count = 0
     for block in store.blocks_of(file):
         sha256.update(block)
-        md5.update(block)
-        size += len(block)
-    return sha256.hexdigest(), md5.hexdigest(), size
+        while block:
+            if size >= 2 * part and count == part:
+                parts.append(hashlib.md5(usedforsecurity=False))
+                count = 0
+            taken = block[: part - count] if size >= 2 * part else block
+            parts[-1].update(taken)
+            block, count = block[len(taken) :], count + len(taken)
+    tag = parts[0].hexdigest()
+    if size >= 2 * part:
+        tag = f"{hashlib.md5(b''.join(one.digest() for one in parts), usedforsecurity=False).hexdigest()}-{len(parts)}"
+    return _Digests(Expected(size, sha256.hexdigest()), tag)
 
 
-def _verify(folder: Path, target: Side, record: Mapping[str, Mapping[str, Any]], md5s: Mapping[str, str]) -> None:
-    """Compare what the storage lists with what was sent; where its checksum is another one, read it back."""
+def _verify(target: Side, sent: Mapping[str, _Digests]) -> None:
+    """Compare what the store lists with what was sent; where its checksum is of another kind, or none, read the file back."""
     there = target.storage.tree(target.path)
-    for name, entry in record.items():
-        found = there.get(name)
-        if found is None or found.size != entry["bytes"]:
-            raise IntegrityError("a file did not arrive as it was sent", where=target.where(name), expected=f"{entry['bytes']} bytes",
+    again = []
+    for name, digests in sent.items():
+        found, size = there.get(name), digests.expected.size
+        if found is None or found.size != size:
+            raise IntegrityError("a file did not arrive as it was sent", where=target.where(name), expected=f"{size} bytes",
                 got="nothing" if found is None else f"{found.size} bytes", remedy="repeat the command to upload it again")  # fmt: skip
-        if found.md5 and found.md5 != md5s[name]:
-            digest = hashlib.sha256()
-            for _ in _pieces(target, name, Expected(found.size), 0, digest):
-                pass
-            if digest.hexdigest() != entry["sha256"]:
-                target.storage.remove(target.below(name))
-                raise IntegrityError("a file did not arrive as it was sent", where=target.where(name),
-                    expected=f"sha256 {entry['sha256'][:16]}...", remedy="repeat the command to upload it again")  # fmt: skip
+        if found.tag != digests.tag:
+            again.append(_ReadingBack(target, name, digests.expected))
+    _all(again, f"reading back from {target.where()}", len(again))
+
+
+@dataclass(frozen=True)
+class _ReadingBack:
+    """One file whose arrival is not known from the listing."""
+
+    target: Side
+    name: str
+    expected: Expected
+
+    def __call__(self) -> None:
+        digest = hashlib.sha256()
+        for _ in _pieces(self.target, self.name, self.expected.size, 0, digest):
+            pass
+        if digest.hexdigest() != self.expected.sha256:
+            self.target.storage.remove(self.target.below(self.name))
+            raise IntegrityError("a file did not arrive as it was sent", where=self.target.where(self.name),
+                expected=f"sha256 {self.expected.sha256[:16]}...", got=f"sha256 {digest.hexdigest()[:16]}...",
+                remedy="repeat the command to upload it again")  # fmt: skip
+
+
+# several at a time ----------------------------------------------------------------------------------------------------
 
 
 def _all(calls: Iterable[Callable[[], None]], description: str, count: int) -> None:
     """All of these, several at a time; the first failure ends what has not begun."""
-    with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool, log.task(description, count) as bar:
+    if not count:
+        return
+    with concurrent.futures.ThreadPoolExecutor(min(WORKERS, count)) as pool, log.task(description, count) as bar:
         waiting: set[concurrent.futures.Future[None]] = set()
         try:
             for call in calls:

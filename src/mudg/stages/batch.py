@@ -42,7 +42,7 @@ class BatchRequest:
 
     Args:
         listed: path or address of the list. out: path or address of the results. batch: how work is shared out. run: settings of the
-            steps. words: the command line behind ``mudg``, for engines that start it elsewhere. wait: for the end of an array job.
+            steps. words: the command line behind ``mudg``, for engines that start it elsewhere. wait: for the end of an array job. scratch: folder for unfinished results.
     """
 
     listed: str
@@ -51,6 +51,7 @@ class BatchRequest:
     run: RunConfig
     words: tuple[str, ...] = ()
     wait: bool = False
+    scratch: Path | None = None
 
 
 def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
@@ -68,7 +69,7 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
     """
     entries = [_absolute(entry) for entry in read_list(asked.listed, (*OF_A_LINE, REVISION))]
     plan = plan_for(asked.batch, asked.run)
-    folder, rules = BatchFolder(Location.of(asked.out)), rules_of(asked.batch)
+    folder, rules = BatchFolder(Location.of(asked.out)), rules_of(asked.batch, asked.scratch)
     if folder.out.local is not None:
         folder = BatchFolder(Location.of(folder.out.local.absolute()))
     _refuse_overlap(entries, folder, asked.listed)
@@ -122,14 +123,14 @@ def _absolute_program(word: str) -> str:
     return os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word
 
 
-def rules_of(batch: BatchConfig) -> WorkRules:
-    """Rules of the workers; UsageError where a setting cannot be read."""
+def rules_of(batch: BatchConfig, scratch: Path | None) -> WorkRules:
+    """Rules of the workers. scratch: folder for unfinished results (None: in the output if it is a folder, else the system's); UsageError where a setting cannot be read."""
     if batch.max_failures and not _LIMIT.fullmatch(batch.max_failures):
         raise UsageError("not a number of failures", where="--max-failures", got=batch.max_failures, expected="as 20 or 5%")
     return WorkRules(
         lease_s=batch.lease_s, grace_s=batch.grace_s, patience_s=batch.patience_s, steal=batch.steal,
         bounds=quality.parse_bounds(batch.bounds), second_share=batch.verify_share, most_failures=batch.max_failures,
-        scratch=Path(batch.scratch).absolute() if batch.scratch else None,
+        scratch=None if scratch is None else Path(scratch).absolute(),
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from mudg.base import store
 from mudg.base.errors import ResourceError, UsageError
 
 _POLL_S: Final = 10.0
@@ -105,8 +106,9 @@ class SlurmArray:
             ResourceError: there is no Slurm, or it refuses.
         """
         if shutil.which("sbatch") is None:
-            raise ResourceError("there is no Slurm on this machine", where="sbatch", remedy="run this on a login node, or take another --engine")
-        Path(self._job.output).parent.mkdir(parents=True, exist_ok=True)
+            remedy = "run this on a login node, or take another --engine"
+            raise ResourceError("there is no Slurm on this machine", where="sbatch", remedy=remedy)
+        store.make_folder(Path(self._job.output).parent)
         self.number = _said(["sbatch", "--parsable"], script_of(self._job)).strip().split(";")[0]
         return self.number
 

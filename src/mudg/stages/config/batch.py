@@ -28,8 +28,6 @@ class BatchConfig:
     part goes on with the others'."""
     jobs: int = Field(default=0, ge=0)
     """Scenes processed at the same time by one task (0 = local: one per processor; else one)."""
-    scratch: str = ""
-    """Folder for unfinished results on this machine (empty = inside --out where that is a folder, else the system's)."""
     lease_s: float = Field(default=600.0, gt=0)
     """A worker that gives no sign of life for so many seconds loses its scene to another."""
     grace_s: float = Field(default=100.0, ge=0)
