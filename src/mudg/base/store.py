@@ -156,12 +156,8 @@ def sync_tree(folder: Path) -> None:
     fsync_directory(folder)
 
 
-def create_once(path: Path, content: bytes, durable: bool = True) -> bool:
-    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one succeeds.
-
-    Args:
-        durable: wait until it is on the disk; not for what means nothing after a crash of the machine.
-    """
+def create_once(path: Path, content: bytes) -> bool:
+    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one succeeds."""
     path = Path(path)
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
@@ -173,13 +169,9 @@ def create_once(path: Path, content: bytes, durable: bool = True) -> bool:
             with os.fdopen(fd, "wb") as handle:
                 handle.write(content)
                 handle.flush()
-                if durable:
-                    os.fsync(handle.fileno())
+                os.fsync(handle.fileno())
             temporary.chmod(0o666 & ~_umask())
-            made = _linked(temporary, path, content)
-            if made and durable:
-                fsync_directory(path.parent)
-            return made
+            return _linked(temporary, path, content)
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -195,6 +187,7 @@ def _linked(temporary: Path, path: Path, content: bytes) -> bool:
                 handle.write(content)
         except FileExistsError:
             return False
+    fsync_directory(path.parent)
     return True
 
 

@@ -42,7 +42,8 @@ class BatchRequest:
 
     Args:
         listed: path or address of the list. out: path or address of the results. batch: how work is shared out. run: settings of the
-            steps. words: the command line behind ``mudg``, for engines that start it elsewhere. wait: for the end of an array job. scratch: folder for unfinished results.
+            steps. words: the command line behind ``mudg``, for engines that start it elsewhere. wait: for the end of an array job.
+        scratch: folder for unfinished results.
     """
 
     listed: str
@@ -124,7 +125,11 @@ def _absolute_program(word: str) -> str:
 
 
 def rules_of(batch: BatchConfig, scratch: Path | None) -> WorkRules:
-    """Rules of the workers. scratch: folder for unfinished results (None: in the output if it is a folder, else the system's); UsageError where a setting cannot be read."""
+    """Rules of the workers; UsageError where a setting cannot be read.
+
+    Args:
+        scratch: folder for unfinished results (None: in the output if that is a folder, else the system's).
+    """
     if batch.max_failures and not _LIMIT.fullmatch(batch.max_failures):
         raise UsageError("not a number of failures", where="--max-failures", got=batch.max_failures, expected="as 20 or 5%")
     return WorkRules(

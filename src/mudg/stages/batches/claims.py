@@ -118,12 +118,25 @@ def take(folder: Location, key: str, owner: Owner, lease_s: float) -> Claim | Bu
         if last.get("state") != WAITING:
             counts[retries.LOST] = counts.get(retries.LOST, 0) + 1
     claim = Claim(folder, key, attempt + 1, owner, lease_s, counts)
-    return claim if _created(claim.file(attempt + 1), claim.content(WORKING, time.time() + lease_s)) else Busy(lease_s)
+    made = _created(claim.file(attempt + 1), claim.content(WORKING, time.time() + lease_s), owner)
+    return claim if made else Busy(lease_s)
 
 
-def _created(file: Location, content: bytes) -> bool:
-    """Create a claim; False if somebody else did. It need not survive a crash of the machine, as its owner does not."""
-    return file.save(content, only_if_absent=True) if file.local is None else store.create_once(file.local, content, durable=False)
+def _created(file: Location, content: bytes, owner: Owner) -> bool:
+    """Create a claim; False if somebody else did. It need not survive a crash of the machine, as its owner does not: no flush."""
+    if file.local is None:
+        return file.save(content, only_if_absent=True)
+    temporary = file.local.with_name(f".{file.name}.{socket.gethostname()}.{owner.process}.part")
+    store.write_in_tree(temporary, content)
+    try:
+        os.link(temporary, file.local)
+    except FileExistsError:
+        return False
+    except OSError:  # no links here
+        return file.save(content, only_if_absent=True)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return True
 
 
 def _longer_here(counts: Mapping[int, int]) -> float:

@@ -36,8 +36,8 @@ class SlurmJob:
 def script_of(job: SlurmJob) -> str:
     """The text of the batch script.
 
-    Slurm sends USR1 to the script some time before the limit, and TERM when it takes the node away. The script passes either on, waits for the
-    checkpoint, and puts the task back into the queue if that is why it ended (exit code 143).
+    Slurm sends USR1 to the script some time before the limit, and TERM when it takes the node away. The script passes either on,
+    waits for the checkpoint, and puts the task back into the queue if that is why it ended (exit code 143).
 
     Raises:
         UsageError: an option that the script sets itself, or one of several lines.
