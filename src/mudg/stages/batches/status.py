@@ -109,8 +109,8 @@ class BatchStatus:
 
     def forecast_s(self) -> float | None:
         """Seconds until the rest is done at the present rate; None if nothing is known."""
-        rate = self.rate()
-        return self.left() / rate if rate > 0 else None
+        left, rate = self.left(), self.rate()
+        return 0.0 if left == 0 else left / rate if rate > 0 else None
 
     def reasons(self) -> list[tuple[str, int, str]]:
         """Reasons of failures with their number and an example, the most frequent first."""
