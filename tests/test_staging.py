@@ -210,7 +210,7 @@ def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) 
 
     staging.run_staged("report", args, write)
     (scratch / "elsewhere").mkdir()
-    name = staging._Plan.of("report", args).folder
+    name = staging._Staging.of("report", args).folder
     name.symlink_to(scratch / "elsewhere")
     with pytest.raises(ResourceError, match="somebody else"):
         staging.run_staged("report", args, write)
