@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from mudg import cli
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.stages import batch
 from mudg.stages.batches import claims, costs, engines, quality, retries, slurm, status, work
@@ -569,3 +569,91 @@ def test_templates_follow_their_schemas_and_start_a_batch() -> None:
     line = next(line for line in task["run"].splitlines() if line.startswith("mudg"))
     assert cli.parse(line.split()[1:]).settings.engine == "env"
     assert differs({"a": 1, "c": "x"}, {"a": str, "b": int}) == [".c", ".b is missing", ".a: 1"]
+
+
+# ---- object stores ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bucket() -> Location:
+    fsspec = pytest.importorskip("fsspec")
+    fsspec.filesystem("memory").store.clear()
+    return Location.of("memory://bucket/runs")
+
+
+def remote_request(out: Location, scratch: Path, count: int = 2) -> work.WorkRequest:
+    folder, plan, listed = BatchFolder(out), plan_of((), {}, COMMAND), entries(count)
+    folder.begin(plan, listed)
+    return work.WorkRequest(folder, plan, listed, work.WorkRules(patience_s=0.0, scratch=scratch))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_results_in_an_object_store(bucket: Location, tmp_path: Path) -> None:
+    asked = remote_request(bucket, tmp_path)
+    assert work.Worker(asked, perform=writes).run() == {"done": 2}
+    for unit in (unit for entry in asked.entries for unit in asked.plan.units(entry)):
+        record = json.loads(asked.folder.done(unit.key).load())
+        assert json.loads((bucket / record["place"] / "x.json").load())["n"] == 7
+    assert status.read_status(asked.folder).stages["command"].done == 2
+    assert work.Worker(asked, perform=lambda *_: pytest.fail("again")).run() == {}  # type: ignore[arg-type, return-value]
+    assert not list((tmp_path / "mudg_batch").iterdir()) and asked.folder.claims.names() == []
+
+
+def test_a_checkpoint_goes_to_the_next_machine(bucket: Location, tmp_path: Path) -> None:
+    asked = remote_request(bucket, tmp_path / "one", 1)
+
+    def stopped(unit, folder):
+        folder.result.mkdir(parents=True)
+        (folder.result / "half").write_text("half")
+        worker.stop()
+        return Ending(143)
+
+    worker = work.Worker(asked, perform=stopped)
+    assert worker.run() == {} and worker.stopped
+    seen = []
+
+    def resumes(unit, folder):
+        seen.append((folder.result / "half").read_text())
+        return writes(unit, folder)
+
+    elsewhere = remote_request(bucket, tmp_path / "two", 1)
+    assert work.Worker(elsewhere, perform=resumes).run() == {"done": 1}
+    assert seen == ["half"] and (asked.folder.own / "partial").names() == []
+
+
+def test_an_upload_that_fails_for_a_moment_costs_no_second_run(
+    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "_PUBLISH_WAITS_S", (0.0, 0.0))
+    tries, runs, publish = [], [], WorkFolder.publish
+
+    def fails_twice(self: WorkFolder) -> None:
+        tries.append(1)
+        if len(tries) <= 2:
+            raise ResourceError("no connection")
+        publish(self)
+
+    def counted(unit, folder):
+        runs.append(1)
+        return writes(unit, folder)
+
+    monkeypatch.setattr(WorkFolder, "publish", fails_twice)
+    assert work.Worker(remote_request(bucket, tmp_path, 1), perform=counted).run() == {"done": 1}
+    assert (len(tries), len(runs)) == (3, 1)
+
+
+def test_a_full_scratch_disk_is_tried_again_and_emptied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retries, "backoff", lambda *_: 0.0)
+    asked = request(tmp_path / "out", 1, scratch=tmp_path / "scratch", patience_s=5.0)
+    runs = []
+
+    def full(unit, folder):
+        runs.append(list((tmp_path / "scratch/mudg_batch").iterdir()))
+        if len(runs) < 3:
+            folder.result.mkdir(parents=True)
+            raise OSError(28, "No space left on device")
+        return writes(unit, folder)
+
+    assert work.Worker(asked, perform=full).run() == {"done": 1}
+    assert [len(there) for there in runs] == [1, 1, 1]
+    assert not list((tmp_path / "scratch/mudg_batch").iterdir())

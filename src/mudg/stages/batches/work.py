@@ -363,7 +363,7 @@ class Worker:
             AGAIN, key=unit.key, attempt=claim.attempt, code=ending.code, words=ending.words[:500], seconds=round(ending.seconds, 3),
             processor_s=round(ending.processor_s, 3),
         )  # fmt: skip
-        claim.give_back(ending.code, time.time() + wait_s)
+        claim.give_back(ending.code, time.time() + wait_s if wait_s else 0.0)
         self._wait_s[unit.key] = wait_s
         return STOPPED if self._stopping else AGAIN
 
