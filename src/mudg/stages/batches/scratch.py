@@ -153,7 +153,7 @@ class WorkFolder:
             shutil.rmtree(self._left, ignore_errors=True)
             self.path.rename(self._left)
         else:
-            self.remove()
+            shutil.rmtree(self.path, ignore_errors=True)
 
     def second(self) -> WorkFolder:
         """A folder for a second run from nothing."""

@@ -84,7 +84,7 @@ class Worker:
     ) -> None:
         self._request, self._rules, self._folder = request, request.rules, request.folder
         index, count = request.shard
-        self.name = f"{socket.gethostname()}-{os.getpid()}-{index}.{request.lane[0]}"
+        self.name = f"{socket.gethostname()}-{os.getpid()}-{index}.{request.lane[0]}-{time.time_ns():x}"
         self._owner = claims.Owner(self.name)
         self._child = ChildProcess(request.rules.grace_s)
         self._perform = perform or self._run_command
