@@ -32,7 +32,6 @@ from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import (
     annotate,
-    batch,
     convert,
     fit,
     fuse,
@@ -44,6 +43,8 @@ from mudg.stages import (
     score_truth,
     synthesize,
 )
+from mudg.stages.batches.listed import ListedRun, run_listed
+from mudg.stages.batches.lists import Entry
 from mudg.stages.config import (
     AnnotateConfig,
     BenchConfig,
@@ -233,10 +234,10 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
     with pytest.raises(UsageError, match="an input"):
         fuse.run_many(FuseConfig(), scenes, scenes, jobs=1, overwrite=True)
     (tmp_path / "status.json").write_text("scenes/a\n")
-    entries = [batch.Entry("c", str(scenes / "a"))]
+    entries = [Entry("c", str(scenes / "a"))]
     for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
         with pytest.raises(UsageError, match=words):
-            batch.run_batch("fuse", entries, tmp_path, fuse._one_of_many, jobs=1, listed=list_file)
+            run_listed(ListedRun("fuse", FuseConfig(), entries, tmp_path, jobs=1, listed=list_file))
     assert (tmp_path / "status.json").read_text() == "scenes/a\n"
 
 
