@@ -97,6 +97,9 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
             time.sleep(0.5)
         yield environment
     finally:
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # no job may outlive its daemons
+            subprocess.run(["scancel", "--full", "--signal=KILL", "--user", "root"], env=environment, capture_output=True, timeout=10)
+            time.sleep(2.0)
         for one in reversed(running):
             one.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
