@@ -19,7 +19,7 @@ from pretend_device import pretend_device
 from scipy.spatial import cKDTree
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
-from mudg.base import store
+from mudg.base import scratch
 from mudg.base.errors import ResourceError
 from mudg.core import trajectory
 from mudg.data.cloudfile import write_fused
@@ -246,9 +246,9 @@ def test_a_full_disk_is_said_before_anything_is_read(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="needs a device that is always full")
 def test_a_disk_that_fills_up_is_an_error_in_words(tmp_path, monkeypatch):
-    monkeypatch.setattr(store.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
+    monkeypatch.setattr(scratch.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
     with pytest.raises(ResourceError, match=r"writing failed[\s\S]*No space left[\s\S]*free disk space"):
-        store.ScratchFile(tmp_path).append(np.zeros(100, np.uint8))
+        scratch.ScratchFile(tmp_path).append(np.zeros(100, np.uint8))
 
 
 # ---- whole fits ------------------------------------------------------------------------------------------------------

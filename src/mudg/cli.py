@@ -14,7 +14,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -406,12 +406,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Idle OpenMP threads that spin would take the cores from the native library's threads; must precede torch.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a wrong flag is told in our words
+        addresses = any("://" in word for word in words)
+        if addresses:
+            from mudg.base import staging
+
+            staging.refuse_secrets(words)
         args = parse(words)
         log.set_quiet(args.quiet)
         if words[0] not in ("doctor", "fuse"):  # they do without torch
             memory.require_address_space(f"mudg {words[0]}")
         with _sigterm_interrupts():
-            result = VERBS[words[0]].call(args)
+            call = VERBS[words[0]].call
+            result = staging.run_staged(words[0], _with_named_output(args), call) if addresses else call(args)
         code = int(result.pop("exit_code", 0))
         _show(result, as_json=args.json)
         return code
@@ -442,6 +448,12 @@ def parse(words: Sequence[str]) -> Any:
 
     examples = "examples:\n" + "\n".join(f"  {line}" for line in VERBS[name].examples)
     return flags.parse(name, words[1:], f"{VERBS[name].summary}\n\n{examples}")
+
+
+def _with_named_output(args: Any) -> Any:
+    """``mudg ingest LOG OUT`` as ``mudg ingest LOG --out OUT``."""
+    words = getattr(args, "words", ())
+    return replace(args, words=words[:-1], out=Path(words[-1])) if len(words) > 1 and args.out is None else args
 
 
 def _say(text: str) -> None:

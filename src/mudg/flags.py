@@ -33,6 +33,9 @@ class Common:
     """Show warnings and the result only: no progress bars, no messages."""
     json: FlagCreatePairsOff[bool] = False
     """Print the result as JSON on stdout."""
+    scratch: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Where inputs and outputs that are addresses (s3://bucket/folder) lie while the command works on them (not given: the system's folder
+    for temporary files)."""
     debug: FlagCreatePairsOff[bool] = False
     """Show the full traceback of an error."""
 

@@ -22,11 +22,11 @@ from mudg.base.errors import UsageError
 from mudg.stages import config as stage_config
 
 Config = TypeVar("Config")
-Location = str | Path
+AnyPath = str | Path
 
 
 def ingest(
-    log: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+    log: AnyPath, out: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any
 ) -> Path:
     """Turn a driving log, or the built-in ``"city"``, into a scene folder; returns the folder."""
     from mudg.stages import ingest as stage
@@ -35,7 +35,7 @@ def ingest(
 
 
 def annotate(
-    scene: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+    scene: AnyPath, out: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any
 ) -> Path:
     """Add dense depth, classes, sky and dynamic objects to a scene, each with a confidence; returns the new scene's folder."""
     from mudg.stages import annotate as stage
@@ -46,7 +46,7 @@ def annotate(
 
 
 def fuse(
-    scene: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+    scene: AnyPath, out: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any
 ) -> Path:
     """Fuse the LiDAR of a scene into coloured clouds, one static and one per object; returns their folder."""
     from mudg.stages import fuse as stage
@@ -54,7 +54,7 @@ def fuse(
     return stage.run(_settings(stage_config.FuseConfig, config, settings), Path(scene), Path(out), overwrite=overwrite)
 
 
-def learn(out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any) -> Path:
+def learn(out: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any) -> Path:
     """Train a diffusion model; returns the model's folder."""
     from mudg.stages import learn as stage
 
@@ -62,7 +62,7 @@ def learn(out: Location, *, overwrite: bool = False, config: Location | None = N
 
 
 def convert(
-    checkpoint: Location, to: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+    checkpoint: AnyPath, to: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any
 ) -> Path:
     """Turn a published checkpoint into a model folder; returns the folder."""
     from mudg.stages import convert as stage
@@ -72,8 +72,8 @@ def convert(
 
 
 def adapt(
-    scene: Location, fused: Location, fitted: Location, out: Location, *,
-    overwrite: bool = False, config: Location | None = None, **settings: Any,
+    scene: AnyPath, fused: AnyPath, fitted: AnyPath, out: AnyPath, *,
+    overwrite: bool = False, config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Adapt the diffusion model to a recorded log, with renders of the scene ``fitted`` to it; returns the model's folder."""
     from mudg.stages import adapt as stage
@@ -83,8 +83,8 @@ def adapt(
 
 
 def synthesize(
-    scene: Location, fused: Location, out: Location, *,
-    fitted: Location | None = None, edits: Location | None = None, overwrite: bool = False, config: Location | None = None,
+    scene: AnyPath, fused: AnyPath, out: AnyPath, *,
+    fitted: AnyPath | None = None, edits: AnyPath | None = None, overwrite: bool = False, config: AnyPath | None = None,
     **settings: Any,
 ) -> Path:  # fmt: skip
     """Generate colour, depth and classes on shifted trajectories; returns the folder of observation sets.
@@ -99,9 +99,9 @@ def synthesize(
 
 
 def fit(
-    scene: Location, fused: Location | None, out: Location, *,
-    observations: Location | Sequence[Location] = (), start_from: Location | None = None, overwrite: bool = False,
-    config: Location | None = None, **settings: Any,
+    scene: AnyPath, fused: AnyPath | None, out: AnyPath, *,
+    observations: AnyPath | Sequence[AnyPath] = (), start_from: AnyPath | None = None, overwrite: bool = False,
+    config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Fit a dynamic Gaussian scene to recorded and, with ``observations``, generated views; returns the model's folder.
 
@@ -119,8 +119,8 @@ def fit(
 
 
 def render(
-    scene: Location, model: Location, out: Location, *,
-    edits: Location | None = None, fused: Location | None = None, overwrite: bool = False, config: Location | None = None,
+    scene: AnyPath, model: AnyPath, out: AnyPath, *,
+    edits: AnyPath | None = None, fused: AnyPath | None = None, overwrite: bool = False, config: AnyPath | None = None,
     **settings: Any,
 ) -> Path:  # fmt: skip
     """Render a fitted scene on recorded and shifted trajectories; returns the folder of observation sets and videos.
@@ -136,8 +136,8 @@ def render(
 
 
 def page(
-    run: Location, out: Location, *, scene: Location | None = None, compare: Location | None = None,
-    overwrite: bool = False, config: Location | None = None, **settings: Any,
+    run: AnyPath, out: AnyPath, *, scene: AnyPath | None = None, compare: AnyPath | None = None,
+    overwrite: bool = False, config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Write a fitted scene as one HTML page; returns the page (``index.html`` of a folder above 32 MB).
 
@@ -150,7 +150,7 @@ def page(
     return stage.run_page(made, Path(run), Path(out), scene=_optional(scene), compare=_optional(compare), overwrite=overwrite)["page"]
 
 
-def report(runs: Sequence[Location], out: Location, *, overwrite: bool = False) -> Path:
+def report(runs: Sequence[AnyPath], out: AnyPath, *, overwrite: bool = False) -> Path:
     """Write one page over finished folders of ``run``, ``score`` or ``bench``; returns the page."""
     from mudg.stages.viewing import gallery as stage
 
@@ -158,9 +158,9 @@ def report(runs: Sequence[Location], out: Location, *, overwrite: bool = False) 
 
 
 def edit(
-    source: Location, script: Location, out: Location, *,
-    scene: Location | None = None, fused: Location | None = None, overwrite: bool = False,
-    config: Location | None = None, **settings: Any,
+    source: AnyPath, script: AnyPath, out: AnyPath, *,
+    scene: AnyPath | None = None, fused: AnyPath | None = None, overwrite: bool = False,
+    config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Change a fit, or a whole run, as an edit script says; returns the folder of the edited one.
 
@@ -176,7 +176,7 @@ def edit(
 
 
 def export_asset(
-    source: Location, track_id: str, out: Location, *, scene: Location | None = None, overwrite: bool = False
+    source: AnyPath, track_id: str, out: AnyPath, *, scene: AnyPath | None = None, overwrite: bool = False
 ) -> Path:
     """Write an object of a fit, or of a run, to a file that edit scripts can insert; returns the file."""
     from mudg.stages.editing import assets
@@ -185,7 +185,7 @@ def export_asset(
 
 
 def import_asset(
-    file: Location, out: Location, *, overwrite: bool = False, config: Location | None = None, **settings: Any
+    file: AnyPath, out: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any
 ) -> Path:
     """Make an asset, or with ``kind="scene"`` the folder of a fit, of a file of Gaussians from another program; returns it."""
     from mudg.stages.exporting import imports
@@ -194,9 +194,9 @@ def import_asset(
 
 
 def export(
-    format: str, source: Location, out: Location, *,
-    scene: Location | None = None, edits: Location | None = None, overwrite: bool = False,
-    config: Location | None = None, **settings: Any,
+    format: str, source: AnyPath, out: AnyPath, *,
+    scene: AnyPath | None = None, edits: AnyPath | None = None, overwrite: bool = False,
+    config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Write a fitted scene, or the cameras of its log, for other programs; returns the file or folder.
 
@@ -210,8 +210,8 @@ def export(
 
 
 def score(
-    scene: Location, views: Mapping[str, Location], out: Location, *,
-    fused: Location | None = None, overwrite: bool = False, config: Location | None = None, **settings: Any,
+    scene: AnyPath, views: Mapping[str, AnyPath], out: AnyPath, *,
+    fused: AnyPath | None = None, overwrite: bool = False, config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Score views of several methods (name -> folder) against truth where there is some; returns the folder of ``metrics.json``."""
     from mudg.stages import score as stage
@@ -226,9 +226,9 @@ def score(
 
 
 def run(
-    log: Location, out: Location, *,
+    log: AnyPath, out: AnyPath, *,
     preset: stage_config.PresetName | None = None, fast: bool = False, seed: int | None = None, overwrite: bool = False,
-    config: Location | None = None, **settings: Any,
+    config: AnyPath | None = None, **settings: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """Run the whole chain on a driving log, a scene or ``"city"``.
 
@@ -257,8 +257,8 @@ def run(
 
 
 def bench(
-    name: str, out: Location, *,
-    sources: Sequence[Location] = (), overwrite: bool = False, config: Location | None = None, **settings: Any,
+    name: str, out: AnyPath, *,
+    sources: Sequence[AnyPath] = (), overwrite: bool = False, config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Run a benchmark; returns the folder of ``bench.json``.
 
@@ -271,7 +271,7 @@ def bench(
     return stage.run(name, made, Path(out), sources=[Path(source) for source in sources], overwrite=overwrite)
 
 
-def doctor(scene: Location | None = None) -> dict[str, Any]:
+def doctor(scene: AnyPath | None = None) -> dict[str, Any]:
     """Say what this machine offers or, with a scene, what is wrong with it."""
     from mudg.stages import doctor as stage
 
@@ -279,7 +279,7 @@ def doctor(scene: Location | None = None) -> dict[str, Any]:
 
 
 def _settings(
-    kind: type[Config], file: Location | None, settings: Mapping[str, Any], preset: Config | None = None
+    kind: type[Config], file: AnyPath | None, settings: Mapping[str, Any], preset: Config | None = None
 ) -> Config:
     return configuration.load(kind, preset, _optional(file), _with_text_paths(settings))
 
@@ -293,9 +293,9 @@ def _with_text_paths(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _several(paths: Location | Sequence[Location]) -> tuple[Path, ...]:
+def _several(paths: AnyPath | Sequence[AnyPath]) -> tuple[Path, ...]:
     return (Path(paths),) if isinstance(paths, (str, Path)) else tuple(map(Path, paths))
 
 
-def _optional(path: Location | None) -> Path | None:
+def _optional(path: AnyPath | None) -> Path | None:
     return None if path is None else Path(path)

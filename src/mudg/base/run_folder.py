@@ -303,7 +303,7 @@ class RunDir:
         if in_the_way or (staged.get("key") == key and not same):
             work = replacement.staging
             for folder in (out, work):
-                _refuse_while_others_work(folder / _LOCK)
+                refuse_while_others_work(folder / _LOCK)
             if staged and staged["key"] != key:
                 log.info(f"{output.verb}: the unfinished replacement of {out} with other settings is given up")
                 remove_files(work, own(work))
@@ -323,7 +323,7 @@ class RunDir:
         """Lock the folder and write down what is made in it."""
         import yaml
 
-        _refuse_while_others_work(self.path / _LOCK)
+        refuse_while_others_work(self.path / _LOCK)
         store.write_json(self.path / _LOCK, {"pid": os.getpid(), "host": socket.gethostname()})
         self._write_state("running", {})
         values = {"verb": self.verb, **json.loads(store.json_text(dict(config)))}
@@ -434,7 +434,8 @@ def _drop_lock_of_the_dead(lock: Path) -> None:
             lock.unlink(missing_ok=True)
 
 
-def _refuse_while_others_work(lock: Path) -> None:
+def refuse_while_others_work(lock: Path) -> None:
+    """ResourceError if the process that wrote this lock still runs on this machine."""
     owner = _owner(lock) if lock.is_file() else None
     if owner is None:
         return

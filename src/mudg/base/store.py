@@ -14,7 +14,6 @@ import shutil
 import stat
 import tempfile
 import threading
-import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -61,11 +60,6 @@ def _writing(path: Path) -> contextlib.AbstractContextManager[None]:
     return disk_errors("writing failed", path, "free disk space or choose another --out")
 
 
-def _make_parent(path: Path) -> None:
-    with disk_errors("cannot create a folder", path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-
-
 _umask_lock = threading.Lock()
 
 
@@ -87,7 +81,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         ResourceError: the folder cannot be written or the disk is full.
     """
     path = Path(path)
-    _make_parent(path)
+    make_folder(path.parent)
     with disk_errors("cannot write here", path):
         if path.exists() and not path.is_file():  # a device would be replaced by a file
             raise ResourceError("cannot write here", where=str(path), got="not a regular file", remedy="choose another --out")
@@ -132,9 +126,16 @@ def write_in_tree(path: Path, content: bytes) -> None:
 
     One journal flush for a thousand small files instead of a thousand.
     """
-    _make_parent(path)
+    make_folder(path.parent)
     with _writing(path):
         Path(path).write_bytes(content)
+
+
+def copy_in_tree(source: Path, path: Path) -> None:
+    """``write_in_tree`` of another file's content."""
+    make_folder(path.parent)
+    with _writing(path):
+        shutil.copyfile(source, path)
 
 
 def sync_tree(folder: Path) -> None:
@@ -153,6 +154,78 @@ def sync_tree(folder: Path) -> None:
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
     fsync_directory(folder)
+
+
+def create_once(path: Path, content: bytes) -> bool:
+    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one succeeds."""
+    path = Path(path)
+    make_folder(path.parent)
+    with disk_errors("cannot write here", path):
+        if os.path.lexists(path):
+            return False
+        fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
+        temporary = Path(name)
+        try:
+            with os.fdopen(fd, "wb") as handle:
+                handle.write(content)
+                handle.flush()
+                os.fsync(handle.fileno())
+            temporary.chmod(0o666 & ~_umask())
+            return _linked(temporary, path, content)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def _linked(temporary: Path, path: Path, content: bytes) -> bool:
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        return temporary.stat().st_nlink == 2  # a network drive can lose the answer to a link that it made
+    except OSError:  # no links here: the name is taken first and filled then
+        try:
+            with path.open("xb") as handle:
+                handle.write(content)
+        except FileExistsError:
+            return False
+    fsync_directory(path.parent)
+    return True
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it. ResourceError if that is refused."""
+    with disk_errors("cannot create a folder", path):
+        Path(path).mkdir(parents=True, exist_ok=True)
+
+
+def append_blocks(path: Path, blocks: Iterable[bytes], begin: int) -> None:
+    """Write blocks into a file under a temporary name, from byte ``begin`` on; what an earlier try left behind it is cut off."""
+    make_folder(path.parent)
+    with _writing(path), Path(path).open("ab" if begin else "wb") as handle:
+        handle.truncate(begin)
+        for block in blocks:
+            handle.write(block)
+        handle.flush()
+        os.fsync(handle.fileno())
+
+
+def take_place(temporary: Path, path: Path) -> None:
+    """Give a file that is complete its name."""
+    with _writing(path):
+        temporary.replace(path)
+        fsync_directory(path.parent)
+
+
+def remove(path: Path) -> None:
+    """Remove a file; none there is no error."""
+    with disk_errors("cannot remove a file", path, "check who may write there"):
+        Path(path).unlink(missing_ok=True)
+
+
+def blocks_of(path: Path) -> Iterator[bytes]:
+    """The content of a file, piece by piece."""
+    with open_file(path) as handle:
+        while block := handle.read(_CHUNK):
+            yield block
 
 
 def write_text(path: Path, text: str) -> None:
@@ -275,7 +348,7 @@ def append_line(path: Path, text: str) -> None:
     Raises:
         ResourceError: it cannot be written; the log is as before.
     """
-    _make_parent(path)
+    make_folder(path.parent)
     with _writing(path), Path(path).open("ab+", buffering=0) as handle:
         end = _end_of_lines(handle)
         left = memoryview((text.rstrip("\n") + "\n").encode())
@@ -302,61 +375,11 @@ def _end_of_lines(handle: BinaryIO) -> int:
     return end
 
 
-class ScratchFile:
-    """A file without a name, for what does not fit into memory. The system removes it with the process, however that ends.
-
-    Blocks are appended by one thread; any thread may read them.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.where = str(folder)
-        with disk_errors("cannot make a scratch file", folder):
-            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
-        self._end = 0
-        self._lock = threading.Lock()
-        weakref.finalize(self, self._file.close)
-
-    def append(self, content: NDArray[np.uint8]) -> int:
-        """Write a block, u8[N], at the end; returns where it begins. ResourceError if the disk is full."""
-        left, began = content.data, self._end
-        with self._lock, _writing(Path(self.where)):
-            self._file.seek(began)
-            while len(left):
-                left = left[self._file.write(left) :]
-        self._end += len(content)
-        return began
-
-    def read(self, begins: int, size: int) -> NDArray[np.uint8]:
-        """The bytes of a block. ResourceError if the disk does not give them back."""
-        found = np.empty(size, np.uint8)
-        left, remedy = found.data, "check the disk, then repeat the command to resume"
-        with disk_errors("a scratch file cannot be read", Path(self.where), remedy):
-            while len(left):
-                count = self._read_into(left, begins + size - len(left))
-                if count == 0:
-                    raise ResourceError("a scratch file ended early", where=self.where, expected=f"{begins + size} bytes",
-                        got=f"{begins + size - len(left)}", remedy=remedy)  # fmt: skip
-                left = left[count:]
-        return found
-
-    def _read_into(self, buffer: memoryview, position: int) -> int:
-        if hasattr(os, "preadv"):
-            return os.preadv(self._file.fileno(), [buffer], position)
-        with self._lock:
-            self._file.seek(position)
-            return self._file.readinto(buffer)
-
-    def close(self) -> None:
-        """Give the space back."""
-        self._file.close()
-
-
 def sha256_file(path: Path) -> str:
     """Hex sha256 of a file's bytes."""
     digest = hashlib.sha256()
-    with open_file(path) as handle:
-        while block := handle.read(_CHUNK):
-            digest.update(block)
+    for block in blocks_of(path):
+        digest.update(block)
     return digest.hexdigest()
 
 

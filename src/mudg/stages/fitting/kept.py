@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mudg.base import log
 from mudg.base.errors import ResourceError
 from mudg.base.processes import GIB, computed_ahead
-from mudg.base.store import ScratchFile
+from mudg.base.scratch import ScratchFile
 from mudg.base.types import Frame
 from mudg.data.observations import ObservationSet
 from mudg.stages.fitting.views import (

@@ -1,0 +1,64 @@
+"""Scratch files: what a computation puts aside because it does not fit into memory."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import weakref
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.errors import ResourceError
+from mudg.base.store import disk_errors
+
+
+class ScratchFile:
+    """A file without a name, for what does not fit into memory. The system removes it with the process, however that ends.
+
+    Blocks are appended by one thread; any thread may read them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.where = str(folder)
+        with disk_errors("cannot make a scratch file", folder):
+            self._file = tempfile.TemporaryFile(dir=folder, buffering=0)
+        self._end = 0
+        self._lock = threading.Lock()
+        weakref.finalize(self, self._file.close)
+
+    def append(self, content: NDArray[np.uint8]) -> int:
+        """Write a block, u8[N], at the end; returns where it begins. ResourceError if the disk is full."""
+        left, began = content.data, self._end
+        with self._lock, disk_errors("writing failed", Path(self.where), "free disk space or choose another --out"):
+            self._file.seek(began)
+            while len(left):
+                left = left[self._file.write(left) :]
+        self._end += len(content)
+        return began
+
+    def read(self, begins: int, size: int) -> NDArray[np.uint8]:
+        """The bytes of a block. ResourceError if the disk does not give them back."""
+        found = np.empty(size, np.uint8)
+        left, remedy = found.data, "check the disk, then repeat the command to resume"
+        with disk_errors("a scratch file cannot be read", Path(self.where), remedy):
+            while len(left):
+                count = self._read_into(left, begins + size - len(left))
+                if count == 0:
+                    raise ResourceError("a scratch file ended early", where=self.where, expected=f"{begins + size} bytes",
+                        got=f"{begins + size - len(left)}", remedy=remedy)  # fmt: skip
+                left = left[count:]
+        return found
+
+    def _read_into(self, buffer: memoryview, position: int) -> int:
+        if hasattr(os, "preadv"):
+            return os.preadv(self._file.fileno(), [buffer], position)
+        with self._lock:
+            self._file.seek(position)
+            return self._file.readinto(buffer)
+
+    def close(self) -> None:
+        """Give the space back."""
+        self._file.close()

@@ -1,0 +1,505 @@
+"""Locations: the same calls on this machine and in an object store; nothing half there, nothing silently wrong, no secret shown."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mudg.base import remote, store, transfer
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.location import Location
+
+fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
+
+
+@pytest.fixture(autouse=True)
+def _empty_memory() -> Iterator[None]:
+    files = fsspec.filesystem("memory")
+    files.store.clear()
+    files.pseudo_dirs[:] = [""]
+    yield
+    files.store.clear()
+
+
+@pytest.fixture(params=["local", "memory"])
+def root(request: pytest.FixtureRequest, tmp_path: Path) -> Location:
+    return Location.of(tmp_path / "store" if request.param == "local" else "memory://bucket/store")
+
+
+class Faulty:
+    """fsspec's store in memory, with a say before every call."""
+
+    def __init__(self, before: Callable[[str, tuple[Any, ...], dict[str, Any]], None]) -> None:
+        self._files, self._before = fsspec.filesystem("memory"), before
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._files, name)
+        if not callable(found):
+            return found
+
+        def call(*args: Any, **options: Any) -> Any:
+            self._before(name, args, options)
+            return found(*args, **options)
+
+        return call
+
+
+@pytest.fixture
+def before(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., None]], None]:
+    """Install what is called before every request; pauses between tries take no time."""
+    monkeypatch.setattr(remote, "FIRST_WAIT_S", 0.0)
+
+    def install(say: Callable[..., None]) -> None:
+        monkeypatch.setattr(remote, "_opened", lambda scheme, process: Faulty(say))
+
+    return install
+
+
+def folder_of(tmp_path: Path, name: str = "made", **more: bytes) -> Path:
+    """A small result: files at two depths, an empty one, a manifest and a record."""
+    folder = tmp_path / name
+    files = {
+        "a/b/deep.bin": bytes(range(256)) * 3,
+        "plain.txt": b"plain",
+        "empty": b"",
+        "run.json": b'{"state": 1}',
+        **more,
+    }
+    for relative, content in files.items():
+        (folder / relative).parent.mkdir(parents=True, exist_ok=True)
+        (folder / relative).write_bytes(content)
+    store.write_manifest(folder)
+    return folder
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# ---- addresses -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ("s3://bucket/a//b/", "s3://bucket/a/b"), (Path("s3://bucket/a"), "s3://bucket/a"), ("S3://bucket", "s3://bucket"),
+        ("abfs://box@account.dfs.core.windows.net/x", "abfs://box@account.dfs.core.windows.net/x"),
+        ("file:///data/my%20runs", "/data/my runs"), (Path("file:///data"), "/data"), ("runs//a/", "runs/a"), ("C:/runs", "C:/runs"),
+        ("gs://bucket/a:b", "gs://bucket/a:b"),
+    ],
+)  # fmt: skip
+def test_an_address_has_one_spelling(given: str | Path, text: str) -> None:
+    assert str(Location.of(given)) == text
+    assert Location.of(Location.of(given)) == Location.of(given)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        "s3://key:hunter2@bucket/x", "s3://key:hun/hunter2@bucket/x", "s3://hunter2@bucket/x", "s3://bucket/x?X-Amz-Signature=hunter2",
+        "abfs://box:hunter2@account/x", "gs://:hunter2@bucket", Path("s3://key:hunter2@bucket/x"),
+    ],
+)  # fmt: skip
+def test_an_address_with_a_secret_is_refused_and_not_shown(given: str | Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        Location.of(given)
+    assert "hunter2" not in str(caught.value)
+    assert "leave" in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    "given", ["ftp://host/x", "s3://", "s3:///x", "s3://bucket/../other", "", "file://host/x", "s3://b::s3://c/x"]
+)
+def test_what_is_no_address_is_refused(given: str) -> None:
+    with pytest.raises(UsageError):
+        Location.of(given)
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/../b", "/a", "a//b", ".", "a\0b"])
+def test_a_name_stays_below(name: str, root: Location) -> None:
+    with pytest.raises(UsageError):
+        _ = root / name
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: Any, **__: Any) -> None:
+        raise ImportError("Install s3fs to access S3")
+
+    remote._opened.cache_clear()
+    monkeypatch.setattr(fsspec, "filesystem", missing)
+    with pytest.raises(ResourceError, match=r"s3fs[\s\S]*pip install 'mudg\[s3\]'"):
+        Location.of("s3://bucket/x").load()
+    with pytest.raises(ResourceError, match=r"gcsfs[\s\S]*mudg\[gs\]"):
+        Location.of("gs://bucket/x").exists()
+    remote._opened.cache_clear()
+
+
+# ---- single files ----------------------------------------------------------------------------------------------------
+
+
+def test_files_are_saved_read_listed_and_removed(root: Location) -> None:
+    assert not root.exists() and root.names() == []
+    assert (root / "b/one").save(b"1") and (root / "a").save(b"12")
+    assert (root / "b/one").save(b"123")
+    assert root.names() == ["a", "b"] and (root / "b").names() == ["one"]
+    assert (root / "b" / "one").load() == b"123" and (root / "b/one").size() == 3
+    assert root.exists() and (root / "b").exists() and (root / "a").exists()
+    (root / "b").remove()
+    (root / "b").remove()
+    (root / "a").remove()
+    assert root.names() == [] and not (root / "b").exists()
+    with pytest.raises(InputError):
+        (root / "a").load()
+    with pytest.raises(InputError):
+        (root / "a").size()
+
+
+def test_only_one_makes_a_file(root: Location) -> None:
+    claim = root / "claims" / "x.json"
+    assert claim.save(b"first", only_if_absent=True)
+    assert not claim.save(b"second", only_if_absent=True)
+    assert claim.load() == b"first" and (root / "claims").names() == ["x.json"]
+    claim.remove()
+    assert claim.save(b"third", only_if_absent=True) and claim.exclusive()
+
+
+RACE = """
+import sys, time
+from pathlib import Path
+from mudg.base.location import Location
+root, me, start = Location.of(sys.argv[1]), sys.argv[2], Path(sys.argv[3])
+(root / ("ready-" + me)).save(b"")
+while not start.exists():
+    time.sleep(0.001)
+print(" ".join(str(n) for n in range(40) if (root / f"claims/{n}").save(me.encode(), only_if_absent=True)))
+"""
+
+
+def test_of_eight_processes_one_makes_each_file(tmp_path: Path) -> None:
+    start, root = tmp_path / "start", Location.of(tmp_path / "store")
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-c", RACE, str(root), str(number), str(start)], stdout=subprocess.PIPE, text=True
+        )
+        for number in range(8)
+    ]
+    while sum(name.startswith("ready-") for name in root.names()) < 8:
+        assert all(worker.poll() is None for worker in workers)
+    start.touch()
+    won = {str(number): worker.communicate()[0].split() for number, worker in enumerate(workers)}
+    assert sorted(name for names in won.values() for name in names) == sorted(map(str, range(40)))
+    for me, names in won.items():
+        assert all((root / "claims" / name).load().decode() == me for name in names)
+    assert len((root / "claims").names()) == 40
+
+
+def test_a_disk_without_links_still_lets_one_make_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(os, "link", refuse)
+    claim = Location.of(tmp_path / "claim")
+    assert claim.save(b"first", only_if_absent=True) and not claim.save(b"second", only_if_absent=True)
+    assert claim.load() == b"first" and os.listdir(tmp_path) == ["claim"]
+
+
+def test_a_store_without_conditional_writes_is_found_out_and_named(
+    before: Callable[..., None], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ignore_mode(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        options.pop("mode", None)
+
+    monkeypatch.setattr(remote, "_exclusive", {})
+    before(ignore_mode)
+    claim = Location.of("memory://weak/claims/a")
+    assert claim.save(b"first", only_if_absent=True) and not claim.save(b"second", only_if_absent=True)
+    assert not claim.exclusive() and claim.load() == b"first"
+    said = capfd.readouterr().err
+    assert said.count("no conditional writes") == 1 and "memory://weak" in said
+    assert Location.of("memory://weak/claims").names() == ["a"], "the probe is gone"
+
+
+def test_a_lost_answer_to_an_exclusive_write_is_no_defeat(
+    before: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first try arrived, its answer did not: the second finds the file there, with its own mark."""
+    notes: dict[str, dict[str, str]] = {}
+    files = fsspec.filesystem("memory")
+    lost = iter([True])
+
+    def say(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        mark = options.pop("Metadata", None)
+        if name == "pipe_file" and options.get("mode") == "create" and mark and not files.exists(args[0]):
+            notes[args[0]] = mark
+            if next(lost, False):
+                files.pipe_file(args[0], args[1])
+                raise ConnectionResetError
+
+    before(say)
+    monkeypatch.setattr(remote.RemoteStore, "_keeps_notes", True)
+    monkeypatch.setattr(remote.RemoteStore, "note", lambda self, path, name: notes.get(path, {}).get(name, ""))
+    assert Location.of("memory://bucket/claim").save(b"mine", only_if_absent=True)
+    assert not Location.of("memory://bucket/claim").save(b"mine", only_if_absent=True)
+
+
+# ---- failures --------------------------------------------------------------------------------------------------------
+
+
+class Answer(OSError):
+    """What a store's package raises for an HTTP status."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(5, f"status {status} with wJalrXUtnFEMI")
+        self.response = {"ResponseMetadata": {"HTTPStatusCode": status}}
+
+
+class NoCredentialsError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("error", "tries", "words"),
+    [
+        (ConnectionRefusedError("no"), 6, "cannot be reached"), (TimeoutError(), 6, "cannot be reached"),
+        (Answer(503), 6, "does not answer"),
+        (Answer(429), 6, "does not answer"), (Answer(403), 1, "refused access"), (Answer(400), 1, "cannot do"),
+        (NoCredentialsError("none"), 1, "no credentials"),
+    ],
+)  # fmt: skip
+def test_failures_are_repeated_by_kind_and_told(
+    error: Exception, tries: int, words: str, before: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def fail(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        asked.append(name)
+        raise error
+
+    before(fail)
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wJalrXUtnFEMI")
+    with pytest.raises(ResourceError, match=words) as caught:
+        Location.of("memory://bucket/x").load()
+    assert len(asked) == tries and caught.value.where == "memory://bucket/x" and caught.value.remedy
+    assert (f"tried {tries} times" in caught.value.got) == (tries > 1)
+    assert "wJalrXUtnFEMI" not in str(caught.value)
+
+
+def test_a_failure_that_passes_is_not_seen(before: Callable[..., None]) -> None:
+    left = [ConnectionResetError(), Answer(500), Answer(409)]
+
+    def fail(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        if left:
+            raise left.pop()
+
+    before(fail)
+    assert Location.of("memory://bucket/x").save(b"1")
+    assert Location.of("memory://bucket/x").load() == b"1"
+
+
+def test_a_mistake_of_the_program_is_not_hidden(before: Callable[..., None]) -> None:
+    def fail(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        raise ZeroDivisionError
+
+    before(fail)
+    with pytest.raises(ZeroDivisionError):
+        Location.of("memory://bucket/x").load()
+
+
+# ---- folders ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_goes_there_and_back(root: Location, tmp_path: Path) -> None:
+    made = folder_of(tmp_path)
+    (made / "lock").write_text("{}")
+    (made / ".x.abcdefgh.part").write_text("half")
+    (root / "run").push(made)
+    assert (root / "run").names() == ["_contents.json", "a", "empty", "manifest.json", "plain.txt", "run.json"]
+    (root / "run").fetch(tmp_path / "back")
+    (made / "lock").unlink()
+    (made / ".x.abcdefgh.part").unlink()
+    assert content(tmp_path / "back") == content(made)
+    (root / "run/plain.txt").fetch(tmp_path / "one")
+    assert (tmp_path / "one").read_bytes() == b"plain"
+
+
+def test_a_folder_that_other_tools_uploaded_is_fetched(root: Location, tmp_path: Path) -> None:
+    made = folder_of(tmp_path)
+    for name, data in content(made).items():
+        (root / "run" / name).save(data)
+    (root / "run").fetch(tmp_path / "back")
+    assert content(tmp_path / "back") == content(made)
+    (root / "run/a/b/deep.bin").save(b"\0" * 768)
+    with pytest.raises(IntegrityError, match=r"deep\.bin"):
+        (root / "run").fetch(tmp_path / "again")
+
+
+def test_nothing_there_is_an_error(root: Location, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nothing is at"):
+        (root / "run").fetch(tmp_path / "back")
+    with pytest.raises(InputError, match="no folder"):
+        (root / "run").push(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("damage", ["altered", "short", "missing"])
+def test_what_is_damaged_in_the_store_is_not_taken(damage: str, root: Location, tmp_path: Path) -> None:
+    (root / "run").push(folder_of(tmp_path))
+    file = root / "run/a/b/deep.bin"
+    if damage == "missing":
+        file.remove()
+    else:
+        file.save(file.load()[1:] + (b"x" if damage == "altered" else b""))
+    with pytest.raises(IntegrityError, match=r"deep\.bin"):
+        (root / "run").fetch(tmp_path / "back")
+    assert not (tmp_path / "back" / "manifest.json").exists()
+
+
+def test_a_record_with_a_name_that_leads_out_is_refused(root: Location, tmp_path: Path) -> None:
+    entry = {"bytes": 1, "sha256": "0" * 64}
+    for name in ("../out", "/etc/x", "a/../../x", "a\\b"):
+        record = {"schema": 1, "state": "complete", "files": {name: entry}, "names": []}
+        (root / "run/_contents.json").save(json.dumps(record).encode())
+        with pytest.raises(IntegrityError, match="leads out"):
+            (root / "run").fetch(tmp_path / "back")
+
+
+def test_stopped_at_any_moment_an_upload_is_no_result_or_a_whole_one(
+    before: Callable[..., None], tmp_path: Path
+) -> None:
+    """Every request that changes something is once the one at which the program ends."""
+    old, new = folder_of(tmp_path, "old", gone=b"old alone"), folder_of(tmp_path, "new", **{"plain.txt": b"changed"})
+    changes, stop_at = 0, 0
+
+    def count(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        nonlocal changes
+        if name in ("pipe_file", "put_file", "rm_file"):
+            changes += 1
+            if changes == stop_at:
+                raise KeyboardInterrupt
+
+    before(count)
+    for moment in itertools.count(1):
+        run, stop_at = Location.of(f"memory://bucket/run{moment}"), 0
+        run.push(old)
+        (run / "theirs").save(b"somebody else's")
+        changes, stop_at = 0, moment
+        try:
+            run.push(new)
+            break
+        except KeyboardInterrupt:
+            stop_at = 0
+        if (run / "manifest.json").exists():
+            run.fetch(tmp_path / f"old{moment}")
+            assert content(tmp_path / f"old{moment}") == content(old)
+        else:
+            with pytest.raises(InputError, match="not finished"):
+                run.fetch(tmp_path / f"half{moment}")
+        run.push(new)
+        run.fetch(tmp_path / f"new{moment}")
+        assert content(tmp_path / f"new{moment}") == content(new)
+        assert (run / "theirs").load() == b"somebody else's" and not (run / "gone").exists()
+    assert moment > 6
+
+
+def test_files_of_others_are_not_overwritten(root: Location, tmp_path: Path) -> None:
+    (root / "run/plain.txt").save(b"somebody else's")
+    with pytest.raises(UsageError, match=r"something else[\s\S]*plain\.txt"):
+        (root / "run").push(folder_of(tmp_path))
+    assert (root / "run").names() == ["plain.txt"] and (root / "run/plain.txt").load() == b"somebody else's"
+
+
+def test_an_unchanged_folder_is_not_sent_again(before: Callable[..., None], tmp_path: Path) -> None:
+    run, made, asked = Location.of("memory://bucket/run"), folder_of(tmp_path), []
+    before(lambda name, args, options: asked.append(name))
+    run.push(made)
+    assert asked.count("put_file") == 4
+    asked.clear()
+    run.push(made)
+    assert not {"put_file", "pipe_file", "rm_file"} & set(asked)
+
+
+def test_a_damaged_upload_is_noticed(before: Callable[..., None], tmp_path: Path) -> None:
+    files = fsspec.filesystem("memory")
+
+    def damage(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        if name == "find" and files.exists("bucket/run/plain.txt"):
+            files.pipe_file("bucket/run/plain.txt", b"PLAIN")
+
+    before(damage)
+    with pytest.raises(IntegrityError, match=r"did not arrive[\s\S]*plain\.txt"):
+        Location.of("memory://bucket/run").push(folder_of(tmp_path))
+    assert not Location.of("memory://bucket/run/manifest.json").exists()
+
+
+def test_a_fetch_goes_on_where_it_was_stopped(
+    before: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transfer, "PIECE", 100)
+    run, made, pieces, left = Location.of("memory://bucket/run"), folder_of(tmp_path), [], 5
+    run.push(made)
+
+    def stop(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        if name == "cat_file" and "deep.bin" in args[0]:
+            pieces.append(options["start"])
+            if len(pieces) == left:
+                raise KeyboardInterrupt
+
+    before(stop)
+    with pytest.raises(KeyboardInterrupt):
+        run.fetch(tmp_path / "back")
+    assert not (tmp_path / "back/manifest.json").exists() and not (tmp_path / "back/a/b/deep.bin").exists()
+    run.fetch(tmp_path / "back")
+    assert pieces == [0, 100, 200, 300, 400, 400, 500, 600, 700]
+    assert content(tmp_path / "back") == content(made)
+    run.fetch(tmp_path / "back")
+    assert len(pieces) == 9, "what is here is not fetched again"
+
+
+def test_the_beginning_of_another_version_is_not_used(tmp_path: Path) -> None:
+    run, made = Location.of("memory://bucket/run"), folder_of(tmp_path)
+    run.push(made)
+    (tmp_path / "back").mkdir()
+    (tmp_path / "back/.plain.txt.fetching.part").write_bytes(b"XX")
+    run.fetch(tmp_path / "back")
+    assert content(tmp_path / "back") == content(made)
+
+
+def test_a_full_disk_is_told_before_anything_is_fetched(
+    root: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (root / "run").push(folder_of(tmp_path))
+    monkeypatch.setattr(transfer.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100, 100, 1000))
+    with pytest.raises(ResourceError, match=r"not enough space[\s\S]*--scratch"):
+        (root / "run").fetch(tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
+@pytest.mark.parametrize("size", [0, 1, 199, 200, 201, 350])
+def test_the_checksum_of_parts_is_that_of_s3(size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one piece below two parts; above, the md5 of the parts' md5s and their number. Blocks of reading fall across parts."""
+    monkeypatch.setattr(transfer, "part_bytes", lambda _: 100)
+    monkeypatch.setattr(store, "_CHUNK", 64)
+    data = (bytes(range(256)) * 2)[:size]
+    (tmp_path / "x").write_bytes(data)
+    parts = [data[at : at + 100] for at in range(0, size, 100)]
+    tag = hashlib.md5(data).hexdigest()
+    if size >= 200:
+        tag = f"{hashlib.md5(b''.join(hashlib.md5(part).digest() for part in parts)).hexdigest()}-{len(parts)}"
+    found = transfer._digests(tmp_path / "x")
+    assert found.tag == tag and found.expected.sha256 == hashlib.sha256(data).hexdigest()
+
+
+def test_a_bucket_is_not_removed(tmp_path: Path) -> None:
+    Location.of("memory://bucket/a").save(b"1")
+    with pytest.raises(UsageError, match="whole bucket"):
+        Location.of("memory://bucket").remove()
+    assert Location.of("memory://bucket/a").exists()
