@@ -205,7 +205,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     if config.compute.recompute:
         for part in trained.values():
             parallel.recompute(part)
-    spread = Spread(model, trained, ranks, config.compute.parallel)
+    spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
     rules = config.optimizer
     optimizer = torch.optim.AdamW(
         [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=rules.weight_decay,

@@ -4,7 +4,7 @@ Every process writes the rows of each tensor that it holds to a safetensors file
 
     steps/step_00000100/
         net.0000.safetensors  net.0000.json     weights: rank 0's rows; name -> shape of the whole tensor, first row
-        net.0001.safetensors  net.0001.json     rank 1's, only if parameters were sharded
+        net.0001.safetensors  net.0001.json     rank 1's, only if parameters were sharded; of several replicas the first one's
         average.*  exp_avg.*  exp_avg_sq.*      moving average and AdamW's moments, in the same way
         state.json  manifest.json               step, seed, layout; SHA-256 of every file
 
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import InputError, IntegrityError
-from mudg.stages.learning.parallel import Ranks, first_row, gathered, is_sharded, local
+from mudg.stages.learning.parallel import Ranks, first_row, gathered, is_copy, is_sharded, local
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -80,9 +80,10 @@ class TrainingState:
             groups["average"] = self.average
         partial = checkpoint.partial_path(folder, self.step)
         sharded = any(map(is_sharded, weights.values()))
+        writes = ranks.leads or (sharded and not any(map(is_copy, weights.values())))
 
         def write_own() -> None:
-            if ranks.leads or sharded:
+            if writes:
                 for name, tensors in groups.items():
                     write_rows(partial, name, ranks.rank, tensors)
 
