@@ -15,6 +15,7 @@ that processes exchange are pickled still. Nothing that is read back here may ex
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,8 +73,9 @@ class TrainingState:
         state = {names[id(p)]: held for p, held in self.optimizer.state.items()}
         return {kind: {name: held[kind] for name, held in state.items()} for kind in MOMENTS}
 
-    def save(self, folder: Path, ranks: Ranks, facts: Mapping[str, Any], keep: int = 2) -> None:
-        """Write a checkpoint of the present step; all processes take part, on a file system that all see."""
+    def save(self, folder: Path, ranks: Ranks, facts: Mapping[str, Any], keep: int = 2) -> float:
+        """Write a checkpoint of the present step; all processes take part, on a file system that all see. Returns the seconds it took."""
+        began = time.monotonic()
         weights = self.trained.state_dict()
         groups = {"net": weights, **self._moments()}
         if self.average is not None:
@@ -91,11 +93,12 @@ class TrainingState:
             ranks.wait()
             ranks.all_do(write_own)
             ranks.wait()
-            return
+            return time.monotonic() - began
         with checkpoint.writing(folder, self.step, {**facts, "processes": ranks.size, "sharded": sharded}, keep):
             ranks.wait()
             ranks.all_do(write_own)
         ranks.wait()
+        return time.monotonic() - began
 
     def resume(self, folder: Path, ranks: Ranks) -> bool:
         """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""
