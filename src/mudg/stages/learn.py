@@ -54,8 +54,8 @@ from mudg.stages.learning.state import TrainingState, mean_of
 
 _OUTPUT = VerbOutput(
     "learn", 1,
-    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", f"{learn_clips.CACHE}/", "samples/*.png", "tensorboard/", "loss.png",
-     "metrics.json", "model/*", "model.part/"),
+    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", f"{learn_clips.CACHE}/", "samples/*.png", "tensorboard/",
+     "loss.png", "metrics.json", "model/*", "model.part/"),
 )  # fmt: skip
 
 
