@@ -122,13 +122,13 @@ def test_bad_scenes_are_left_out_up_to_a_limit(clips, tmp_path, capsys):
     assert {n // 100_000_000 for n in one.bad} == {3, 4}
     said = capsys.readouterr().err
     assert said.count("scenes/3") >= 1 and said.count("left out") == 2
-    list(map(lambda step: learn_clips.draw_clips(config, knowing, step, 2, 2, "batch"), range(12)))
+    [learn_clips.draw_clips(config, knowing, step, 2, 2, "batch") for step in range(12)]
     again = [clip.rgb for step in range(12) for clip in learn_clips.draw_clips(config, knowing, step, 2, 2, "batch")]
     assert all(map(torch.equal, first, again))  # what was known before changes nothing
     parts = [learn_clips.draw_clips(config, opened(), 5, 4, 2, "batch", slice(n, n + 1))[0].rgb for n in range(4)]
     assert all(map(torch.equal, parts, [c.rgb for c in learn_clips.draw_clips(config, one, 5, 4, 2, "batch")]))
     with pytest.raises(UsageError, match="too many scenes"):
-        list(map(lambda step: learn_clips.draw_clips(config, opened(0.2), step, 2, 2, "batch"), range(40)))
+        [learn_clips.draw_clips(config, opened(0.2), step, 2, 2, "batch") for step in range(40)]
 
 
 def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):

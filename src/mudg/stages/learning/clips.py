@@ -260,7 +260,6 @@ def describe_list(config: LearnConfig, shards: ListedShards) -> str:
     return (
         f"clips of {config.data.window} frames of {len(shards.scenes.scenes)} listed scenes at "
         f"{config.data.width}x{config.data.height} pixels\n"
-        f"{config.data.width}x{config.data.height} pixels\n"
         f"({shares}). {len(shards.scenes.scored)} scenes were held out for scoring."
     )
 

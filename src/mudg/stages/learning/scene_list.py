@@ -343,6 +343,5 @@ class ListedShards:
             if record is None:
                 raise InputError("no clips and no log here", where=place.text,
                     remedy="check the address, and whether its upload was finished")  # fmt: skip
-                    remedy="check the address, and whether its upload was finished")  # fmt: skip
             facts.append(hashlib.sha256(record.load()).hexdigest())
         return self._of_log(None, scored, with_log, " ".join(facts))
