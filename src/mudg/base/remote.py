@@ -205,7 +205,7 @@ def repeated(call: Callable[[], Result], doing: str, where: str) -> Result:
             if kind not in ("connection", "busy") or tries >= TRIES:
                 raise _told(error, kind, doing, where, tries) from error
             if tries == 2:
-                log.info(f"{where}: {_WORDS[kind][0]}; {doing} is tried again")
+                log.info_once(f"{'/'.join(where.split('/')[:3])}: {_WORDS[kind][0]}; {doing} is tried again")
         time.sleep(_pause_s(tries))
 
 

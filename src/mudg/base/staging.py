@@ -53,7 +53,7 @@ def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]]) -> d
     Raises:
         UsageError: an address where none can be, or an output that touches an input. Whatever transfers and the verb raise.
     """
-    plan = _Plan.of(verb, args)
+    plan = _Staging.of(verb, args)
     if not plan.inputs and not plan.outputs:
         return call(args)
     with plan.locked():
@@ -72,7 +72,7 @@ def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]]) -> d
 
 
 @dataclass
-class _Plan:
+class _Staging:
     """Which address lies where on this machine while the command runs."""
 
     args: Any
@@ -81,7 +81,7 @@ class _Plan:
     outputs: dict[Location, Path] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, verb: str, args: Any) -> _Plan:
+    def of(cls, verb: str, args: Any) -> _Staging:
         found = sorted({str(one) for item in fields(args) if item.name != "settings" for one in _addresses(getattr(args, item.name))})
         key = hashlib.sha256("\n".join([verb, *found]).encode()).hexdigest()[:12]
         given = getattr(args, "scratch", None)

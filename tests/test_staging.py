@@ -1,0 +1,221 @@
+"""Commands on addresses: fetched, worked on in a scratch folder, uploaded; stopped at any moment they go on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mudg import cli
+from mudg.base import staging, store
+from mudg.base.location import Location
+
+fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
+
+CITY = (
+    "--city.n-frames",
+    "2",
+    "--city.width",
+    "48",
+    "--city.height",
+    "32",
+    "--city.cameras",
+    "front",
+    "--no-contact-sheet",
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("scenes") / "city"
+    assert cli.main(["ingest", "city", str(out), *CITY, "--quiet"]) == 0
+    return out
+
+
+@pytest.fixture(autouse=True)
+def _empty_memory() -> Iterator[None]:
+    files = fsspec.filesystem("memory")
+    files.store.clear()
+    files.pseudo_dirs[:] = [""]
+    yield
+    files.store.clear()
+
+
+@pytest.fixture
+def scratch(tmp_path: Path) -> Path:
+    return tmp_path / "scratch"
+
+
+@pytest.fixture
+def command(scratch: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    def run(*words: str) -> tuple[int, str, str]:
+        code = cli.main([*words, "--scratch", str(scratch), "--quiet"])
+        said = capfd.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+def at(address: str) -> Location:
+    return Location.of(address)
+
+
+def test_two_steps_from_store_to_store(command: Callable[..., Any], scratch: Path, scene: Path, tmp_path: Path) -> None:
+    at("memory://bucket/city").push(scene)
+    code, said, _ = command("fuse", "memory://bucket/city", "--out", "memory://bucket/runs/fused", "--json")
+    assert code == 0 and json.loads(said) == {"fused": "memory://bucket/runs/fused"}
+    assert not any(scratch.iterdir()), "nothing is left behind"
+    at("memory://bucket/runs/fused").fetch(tmp_path / "fused")
+    assert cli.main(["fuse", str(scene), "--out", str(tmp_path / "here"), "--quiet"]) == 0
+    assert store.digest(tmp_path / "fused") == store.digest(tmp_path / "here")
+    record = (tmp_path / "fused/run.json").read_text()
+    assert json.loads(record)["key"] == json.loads((tmp_path / "here/run.json").read_text())["key"]
+
+
+def test_the_output_of_ingest_may_stand_after_the_log(command: Callable[..., Any], scratch: Path) -> None:
+    assert command("ingest", "city", "memory://bucket/city", *CITY)[0] == 0
+    assert "scene.json" in at("memory://bucket/city").names() and not any(scratch.iterdir())
+
+
+def test_a_finished_result_is_reused_and_another_refused(command: Callable[..., Any], scene: Path) -> None:
+    at("memory://bucket/city").push(scene)
+    words = ("fuse", "memory://bucket/city", "--out", "memory://bucket/fused")
+    assert command(*words)[0] == 0
+    before = at("memory://bucket/fused/run.json").load()
+    assert command(*words)[0] == 0
+    assert at("memory://bucket/fused/run.json").load() == before
+    code, _, said = command(*words, "--voxel-m", "0.3")
+    assert code == 2 and "another configuration" in said
+    assert at("memory://bucket/fused/run.json").load() == before
+    code, _, said = command(*words, "--voxel-m", "0.3", "--overwrite")
+    assert code == 0 and at("memory://bucket/fused/run.json").load() != before
+
+
+@pytest.mark.parametrize("fails", ["put_file", "pipe_file", "cat_file"])
+def test_stopped_in_a_transfer_the_same_command_goes_on(
+    fails: str, command: Callable[..., Any], scratch: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at("memory://bucket/city").push(scene)
+    files, calls, computed = fsspec.filesystem("memory"), [], []
+    found = getattr(type(files), fails)
+
+    def failing(self: Any, *args: Any, **options: Any) -> Any:
+        calls.append(args[0])
+        if len(calls) == 3:
+            raise PermissionError("refused")
+        return found(self, *args, **options)
+
+    from mudg.stages import fuse
+
+    run = fuse.run
+    monkeypatch.setattr(fuse, "run", lambda *args, **options: computed.append(1) or run(*args, **options))
+    with monkeypatch.context() as patch:
+        patch.setattr(type(files), fails, failing)
+        code, _, said = command("fuse", "memory://bucket/city", "--out", "memory://bucket/fused")
+    assert code == 5 and "refused access" in said
+    assert not at("memory://bucket/fused/manifest.json").exists()
+    assert any(scratch.iterdir())
+    assert command("fuse", "memory://bucket/city", "--out", "memory://bucket/fused")[0] == 0
+    assert at("memory://bucket/fused/manifest.json").exists() and not any(scratch.iterdir())
+
+
+def test_a_file_goes_to_an_address_too(command: Callable[..., Any], scene: Path) -> None:
+    """What several verbs write is one file, and some put a folder beside it."""
+
+    def write(args: Any) -> dict[str, Any]:
+        args.out.write_text("page")
+        (args.out.parent / "page_more").mkdir()
+        (args.out.parent / "page_more/x.bin").write_bytes(b"x")
+        return {"page": args.out, "text": f"see {args.out}"}
+
+    from mudg import flags
+
+    args = flags.ReportFlags(runs=(scene,), out=Path("memory://bucket/pages/page.html"))
+    said = staging.run_staged("report", args, write)
+    assert said == {"page": "memory://bucket/pages/page.html", "text": "see memory://bucket/pages/page.html"}
+    assert (
+        at("memory://bucket/pages/page.html").load() == b"page"
+        and at("memory://bucket/pages/page_more/x.bin").load() == b"x"
+    )
+
+
+def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
+    at("memory://bucket/a/views").save(b"views")
+    at("memory://bucket/scene").save(b"scene")
+    seen = {}
+
+    def look(args: Any) -> dict[str, Any]:
+        seen.update(
+            scene=args.scene.read_bytes(),
+            views=[Path(one.partition("=")[2]).read_bytes() for one in args.views],
+            out=args.out,
+        )
+        return {}
+
+    from mudg import flags
+    from mudg.stages.config import ScoreConfig
+
+    views = ("mine=memory://bucket/a/views", f"theirs={scratch / 'x'}")
+    scratch.mkdir()
+    (scratch / "x").write_bytes(b"local")
+    args = flags.Score(
+        scene=Path("memory://bucket/scene"), views=views, out=scratch / "out", scratch=scratch, settings=ScoreConfig()
+    )
+    staging.run_staged("score", args, look)
+    assert seen == {"scene": b"scene", "views": [b"views", b"local"], "out": scratch / "out"}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("fuse", "memory://bucket/a", "--out", "memory://bucket/a"), "touches an input"),
+        (("fuse", "memory://bucket/a", "--out", "memory://bucket/a/fused"), "touches an input"),
+        (("fuse", "memory://bucket/none", "--out", "memory://bucket/fused"), "nothing is at"),
+        (("fuse", "--list", "memory://bucket/list", "--out", "somewhere"), "--list"),
+        (("fuse", "https://host/a", "--out", "memory://bucket/fused"), "no storage of this kind"),
+        (("fuse", "memory://bucket/a", "--out", "memory://bucket"), "in a bucket"),
+        (("fuse", "memory://bucket/a", "--out", "memory://bucket/theirs"), "something else"),
+        (("synthesize", "memory://bucket/a", "--fused", "x", "--model", "s3://bucket/m", "--out", "y"), "--model"),
+        (("fuse", "s3://me:hunter2@bucket/a", "--out", "x"), "password"),
+        (("fuse", "a", "--out=s3://me:hunter2@bucket/a"), "password"),
+        (("score", "a", "--views", "m=s3://me:hunter2@bucket/a", "--out", "x"), "password"),
+        (("fuse", "https://me:hunter2@host/a", "--nonsense", "--out", "x"), "password"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(words: tuple[str, ...], said: str, command: Callable[..., Any]) -> None:
+    at("memory://bucket/theirs/x").save(b"somebody else's")
+    at("memory://bucket/a/x").save(b"1")
+    code, out, err = command(*words)
+    assert code in (2, 3) and said in err
+    assert "hunter2" not in out + err
+
+
+def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) -> None:
+    """Not at the same time, and not that of another user."""
+    from mudg import flags
+    from mudg.base.errors import ResourceError
+
+    args = flags.ReportFlags(runs=(scene,), out=Path("memory://bucket/page.html"), scratch=scratch)
+
+    def write(inner: Any) -> dict[str, Any]:
+        (folder,) = scratch.iterdir()
+        store.write_json(folder / "lock", {"pid": 1, "host": __import__("socket").gethostname()})
+        with pytest.raises(ResourceError, match="another process"):
+            staging.run_staged("report", args, write)
+        inner.out.write_text("page")
+        return {}
+
+    staging.run_staged("report", args, write)
+    (scratch / "elsewhere").mkdir()
+    name = staging._Staging.of("report", args).folder
+    name.symlink_to(scratch / "elsewhere")
+    with pytest.raises(ResourceError, match="somebody else"):
+        staging.run_staged("report", args, write)
+
+
+def test_a_command_without_addresses_is_not_touched() -> None:
+    args = object()
+    assert cli._with_named_output(args) is args
