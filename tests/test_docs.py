@@ -28,7 +28,10 @@ FLAGS: dict[str, list[str]] = json.loads((REPOSITORY / "tests" / "house" / "cli.
 
 FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--standalone": "torchrun",
                  "--version": "mudg", "--dist": "pytest", "--help": "every verb", "--help-all": "mudg run, mudg demo",
-                 **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker")}  # fmt: skip
+                 **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker"),
+                 **dict.fromkeys(("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle",
+                                  "--shutdown-timeout"), "torchrun"),
+                 **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch")}  # fmt: skip
 FOLDERS = "base core native data models report stages bench docs tests tools build_backend src".split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 

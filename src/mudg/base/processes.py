@@ -102,8 +102,14 @@ def process_alive(pid: int) -> bool:
 # ---- interrupts ------------------------------------------------------------------------------------------------------
 
 
+_NOTICES = (signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()
+"""Signals that announce the end of a job."""
+
+
 class Interruption:
-    """Ctrl-C and SIGTERM wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
+    """Ctrl-C, SIGTERM and SIGUSR1 wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
+
+    SIGUSR1 is what batch systems send some time before they end a job; it then stops the program as SIGTERM does.
 
     Outside the main thread signals are left as they are.
 
@@ -120,7 +126,7 @@ class Interruption:
 
     def __enter__(self) -> Interruption:
         if threading.current_thread() is threading.main_thread():
-            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
+            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM, *_NOTICES)}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -143,9 +149,11 @@ class Interruption:
 
     def stop_now(self, number: int = 0, frame: types.FrameType | None = None) -> None:
         """Do what the signal would have done at once: raise KeyboardInterrupt, or what the program has set."""
-        before = self._before.get(number or self._number)
+        number = number or self._number
+        number = signal.SIGTERM if number in _NOTICES else number
+        before = self._before.get(number)
         if callable(before):
-            before(number or self._number, frame)
+            before(number, frame)
         raise KeyboardInterrupt
 
 

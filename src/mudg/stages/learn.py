@@ -10,13 +10,16 @@ OUT/clips/    one shard per city or clip of a log (or the folder `data.clips` of
 OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the network, its moving average, the optimiser
 OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl, OUT/metrics.json
 OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
+OUT/cache/    clips that were fetched or made when they were drawn; removed at the end
 OUT/tensorboard/  with `compute.tensorboard`
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib.util
+import shutil
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -29,9 +32,11 @@ from torch import Tensor
 from mudg.base import log, store
 from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError, UsageError
+from mudg.base.location import Location
 from mudg.base.processes import Interruption
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.clips import from_log
+from mudg.data.clips.shards import ShardSource
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings
@@ -44,12 +49,13 @@ from mudg.stages.learning.clips import class_weights, draw_clips
 from mudg.stages.learning.models import Model, draw_weights, freeze, hold_finisher, kind_of, starting_model
 from mudg.stages.learning.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
 from mudg.stages.learning.precision import choose_bf16
+from mudg.stages.learning.scene_list import ListedShards, is_list, read_list
 from mudg.stages.learning.state import TrainingState, mean_of
 
 _OUTPUT = VerbOutput(
     "learn", 1,
-    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", "samples/*.png", "tensorboard/", "loss.png",
-     "metrics.json", "model/*", "model.part/"),
+    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", f"{learn_clips.CACHE}/", "samples/*.png", "tensorboard/",
+     "loss.png", "metrics.json", "model/*", "model.part/"),
 )  # fmt: skip
 
 
@@ -66,6 +72,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
         raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
             remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
     config = _checked_condition(config)
+    learn_clips.is_streamed(config)  # refuses what does not go together
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
@@ -97,9 +104,12 @@ def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunD
     settings = {name: value for name, value in to_dict(config).items() if name != "compute"}
 
     def open_run() -> str:
-        sources = [from_log.log_source(text) for text in config.data.scenes]
+        listed = is_list(config.data.scenes)
+        sources = [] if listed else [from_log.log_source(text) for text in config.data.scenes]
         _refuse_overlap(config, out, sources, overwrite)
         inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
+        if listed:
+            inputs["list of scenes"] = hashlib.sha256(Location.of(config.data.scenes[0]).load()).hexdigest()
         for number, source in enumerate(sources):
             inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
         opened.append(RunDir.open(out, _OUTPUT, settings, inputs, overwrite))
@@ -119,7 +129,11 @@ def _refuse_overlap(config: LearnConfig, out: Path, sources: Sequence[from_log.L
     read: dict[str, Path | str] = {"start": mdm_files.folder_of(config.start) if config.start else ""}
     for number, source in enumerate(sources):
         read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
-    clips = config.data.clips
+    if is_list(config.data.scenes):
+        listed = [text for scene in read_list(config.data.scenes[0]).scenes for text in scene.path.split("=")]
+        read |= {f"scene {text}": text for text in listed if Location.of(text).local is not None}
+        read["list"] = config.data.scenes[0] if Location.of(config.data.scenes[0]).local is not None else ""
+    clips = "" if learn_clips.clips_at_address(config) else config.data.clips
     own_clips = not overwrite and Path(clips).resolve() == (out / "clips").resolve()
     refuse_overlap(out, {**read, "clips": "" if own_clips else clips})
 
@@ -128,18 +142,21 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
     """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user said."""
     out, given, kind = directory.path, config, kind_of(model)
     bf16 = choose_bf16(config.precision, ranks.device)
-    folder = Path(config.data.clips) if config.data.clips else out / "clips"
+    folder: Path | ShardSource = Path(config.data.clips) if config.data.clips else out / "clips"
     about_data = ""
     if isinstance(model, MDM) and not model.config.renders:
         config = learn_clips.without_renders(config)
     making: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
-    if config.data.scenes:
+    if learn_clips.is_streamed(config):
+        config, folder = learn_clips.open_streamed(config, out, model.config.pixel_multiple, model.points_alone)
+        about_data = learn_clips.describe_list(config, folder) if isinstance(folder, ListedShards) else ""
+    elif isinstance(folder, Path) and config.data.scenes:
         sources = [from_log.log_source(text) for text in config.data.scenes]
         rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, model.points_alone)
-        counts = ranks.leader_does(lambda: learn_clips.make_log_clips(given, rules, folder))
+        counts = ranks.leader_does(partial(learn_clips.make_log_clips, given, rules, folder))
         config = learn_clips.for_logs(config, rules, *counts)
         about_data = learn_clips.describe_logs(config, rules)
-    elif ranks.leads:
+    elif isinstance(folder, Path) and ranks.leads:
         making = learn_clips.MakingClips(config, folder, model.points_alone)
     if model.points_alone:
         config = learn_clips.of_one_size(config)
@@ -155,7 +172,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
-        hold_finisher(model, fresh, learn_clips.have_patches(folder, config.data.skip_cities))
+        hold_finisher(model, fresh, learn_clips.have_patches(config, folder, config.data.skip_cities))
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 
     def finish() -> None:
@@ -163,20 +180,21 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
             made.refiner.take_back(_class_weights(config, folder))
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-        scores = learn_score.score(made, learn_clips.scored_shards(config), folder, request)
+        scores = learn_score.score(made, learn_clips.scored_shards(config, folder), folder, request)
         store.write_json(out / "metrics.json", scores)
         facts: dict[str, Any] = {"recipe": to_dict(given), "held_out": scores}
         if config.start:
             facts["continued_from"] = mdm_files.facts(config.start)
         kind.save(made, out / "model", kind.card(made, config, scores, about_data), facts)
+        shutil.rmtree(out / learn_clips.CACHE, ignore_errors=True)
         directory.finish({"held_out": scores["average"]})
         log.info(learn_score.table(scores))
 
     ranks.leader_does(finish)
 
 
-def _class_weights(config: LearnConfig, folder: Path) -> Tensor:
-    return class_weights(folder, learn_clips.cities_in_use(config, 0)[:20], config.loss.class_balance)
+def _class_weights(config: LearnConfig, folder: Path | ShardSource) -> Tensor:
+    return class_weights(folder, learn_clips.weighed_shards(config, folder), config.loss.class_balance)
 
 
 # network --------------------------------------------------------------------------------------------------------------
@@ -205,7 +223,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     if config.compute.recompute:
         for part in trained.values():
             parallel.recompute(part)
-    spread = Spread(model, trained, ranks, config.compute.parallel)
+    spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
     rules = config.optimizer
     optimizer = torch.optim.AdamW(
         [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=rules.weight_decay,
@@ -222,8 +240,23 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     return state, spread
 
 
+def _batch(config: LearnConfig, ranks: Ranks, step: int) -> tuple[int, int, list[slice]]:
+    """Frames of a clip at `step`, clips of the whole batch, and this process's portions of it."""
+    frames = frames_at(config, step)
+    count = max(1, config.optimizer.batch_frames // frames)
+    return frames, count, ranks.share(count, config.compute.accumulate)
+
+
+def _reading_ahead(config: LearnConfig, folder: Path | ShardSource, ranks: Ranks) -> learn_clips.ReadingAhead:
+    def bring(step: int) -> None:
+        frames, count, parts = _batch(config, ranks, step)
+        learn_clips.bring_shards(config, folder, step, count, frames, parts)
+
+    return learn_clips.ReadingAhead(bring, 0 if isinstance(folder, Path) else config.compute.read_ahead, config.steps)
+
+
 def _train_network(
-    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool, ranks: Ranks
+    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, ranks: Ranks
 ) -> dict[str, Tensor]:
     """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     out = run_dir.path / "steps"
@@ -234,13 +267,15 @@ def _train_network(
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
-    with log.task("network", config.steps, begun) as bar, Interruption(SAME_SIGNAL_S) as interruption:
+    with (
+        log.task("network", config.steps, begun) as bar, Interruption(SAME_SIGNAL_S) as interruption,
+        _reading_ahead(config, folder, ranks) as ahead,
+    ):  # fmt: skip
         for step in range(begun, config.steps):
+            ahead.beyond(step)
             for group in state.optimizer.param_groups:
                 group["lr"] = learning_rate(config, step)
-            frames = frames_at(config, step)
-            count = max(1, config.optimizer.batch_frames // frames)
-            parts = ranks.share(count, config.compute.accumulate)
+            frames, count, parts = _batch(config, ranks, step)
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
             for part in parts:
@@ -268,7 +303,8 @@ def _train_network(
                     _record(run_dir, board, done, {"frames": frames, "rate": round(rate, 3), **mean_of(recent)})
                 recent = []
             if done % config.compute.checkpoint_every == 0 or last or stop:
-                state.save(out, ranks, facts)
+                took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
+                log.info(f"learn: checkpoint of step {done} in {took_s:.2f} s")
                 saved_at = done
             if done % config.score.every == 0 or last:
                 made = state.export_weights(ranks)
@@ -297,11 +333,12 @@ def _tensorboard(folder: Path) -> Any:
 
 
 def _score_watched(
-    model: Model, weights: dict[str, Tensor], config: LearnConfig, run_dir: RunDir, folder: Path, step: int, bf16: bool
+    model: Model, weights: dict[str, Tensor], config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, step: int,
+    bf16: bool,
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
     made = kind_of(model).rebuilt(model, weights)
-    shards = learn_clips.scored_shards(config)[: config.score.watched]
+    shards = learn_clips.scored_shards(config, folder)[: config.score.watched]
     request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
     picture = run_dir.path / "samples" / f"{step:07d}.png"
     scores = learn_score.score(made, shards, folder, request, picture=picture)

@@ -20,10 +20,10 @@ and, for patches at a higher resolution, all of these once more as fine_NAME, wi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Camera, Clip, Condition, FinePatch, View
 
+Result = TypeVar("Result")
 FAR_M = 1000.0
 FINE = "fine_"
 """What the names of a patch's arrays begin with."""
@@ -120,9 +121,26 @@ def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic
     store.write_safetensors(shard_path(folder, city), dict(arrays))
 
 
-def clips_in(folder: Path, city: int) -> int:
+class ShardSource(Protocol):
+    """Shards that are brought to this machine when they are needed, by number."""
+
+    def clips_in(self, number: int) -> int:
+        """Number of clips in a shard."""
+        ...
+
+    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
+        """What `read` makes of a shard's file."""
+        ...
+
+
+def clips_in(folder: Path | ShardSource, city: int) -> int:
     """Number of clips in a shard."""
-    with _open(shard_path(folder, city)) as shard:
+    return clips_at(shard_path(folder, city)) if isinstance(folder, Path) else folder.clips_in(city)
+
+
+def clips_at(path: Path) -> int:
+    """Number of clips in the shard at `path`."""
+    with _open(path) as shard:
         return int(shard.get_slice("shift_m").get_shape()[0])
 
 
@@ -141,9 +159,16 @@ _PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "ba
 _RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
 
 
-def read_clip(folder: Path, city: int, clip: int, frames: Sequence[int]) -> Clip:
+def read_clip(folder: Path | ShardSource, city: int, clip: int, frames: Sequence[int]) -> Clip:
     """Some frames of one clip of a shard, as a `Clip`. Shards hold no times: frame numbers stand for seconds."""
-    with _open(shard_path(folder, city)) as shard:
+    if isinstance(folder, Path):
+        return clip_at(shard_path(folder, city), clip, frames)
+    return folder.reading(city, lambda path: clip_at(path, clip, frames))
+
+
+def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
+    """The same, of the shard at `path`."""
+    with _open(path) as shard:
         made = _read_part(shard, "", clip, frames)
         if f"{FINE}place" not in shard.keys():
             return made

@@ -25,7 +25,7 @@ class LearnData:
     """Frames per clip."""
     clips: str = ""
     """Folder of training clips to read; missing clips are added to it (empty = a folder inside the output). Give an earlier run's
-    folder to reuse its clips."""
+    folder to reuse its clips. At an address such as s3://bucket/clips all clips must be there; they are fetched when needed."""
     augment: bool = True
     """Vary the training clips: change colours, mirror, and corrupt the classes in the condition."""
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
@@ -63,7 +63,10 @@ class LearnData:
     held_out: int = Field(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
-    """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each."""
+    """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each. Or one list of many
+    scenes, a file that ends in .yaml, .json or .txt (docs/training.md)."""
+    bad_scenes: float = Field(default=0.02, ge=0, le=1)
+    """Scenes of a list: share that may be missing or damaged. These are named and left out; more end the training."""
     cameras: tuple[str, ...] = ()
     """Logs: cameras to take clips from (empty = all)."""
     stride: int = Field(default=4, ge=1)
@@ -171,8 +174,11 @@ class LearnCompute:
     device: DeviceName = "auto"
     """Device on which the networks are trained and scored: auto (CUDA if there is one), cpu, cuda, cuda:N, mps. Under torchrun cuda is
     one device for each process. Clips are made on the CPU."""
-    parallel: Literal["ddp", "fsdp"] = "ddp"
-    """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state."""
+    parallel: Literal["ddp", "fsdp", "hsdp"] = "ddp"
+    """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state over all processes; hsdp
+    shards them within each node and keeps a replica on every node."""
+    processes_per_replica: int = Field(default=0, ge=0)
+    """hsdp: processes over which one replica is sharded (0 = the processes of a node)."""
     accumulate: int = Field(default=1, ge=1)
     """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory and gives
     the same result."""
@@ -184,6 +190,15 @@ class LearnCompute:
     logs are made before training starts, by this process if 0."""
     checkpoint_every: int = Field(default=100, ge=1)
     """Steps between checkpoints; an interrupted training resumes at the last one."""
+    checkpoints_kept: int = Field(default=2, ge=2)
+    """Newest checkpoints to keep; older ones are removed."""
+    cache: str = ""
+    """Folder for training clips that are fetched or made when they are needed; several runs and processes may share it (empty = a folder
+    inside the output)."""
+    cache_gb: float = Field(default=50.0, gt=0)
+    """Largest size of that folder in GB. The clips that were not used for the longest time are removed first."""
+    read_ahead: int = Field(default=4, ge=0)
+    """Steps ahead for which training clips are fetched or made (0 = none)."""
     log_every: int = Field(default=50, ge=1)
     """Steps between lines of log.jsonl."""
     tensorboard: bool = False

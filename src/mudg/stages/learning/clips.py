@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,24 @@ import torch
 from torch import Tensor
 
 from mudg.base import log, seeds
-from mudg.base.errors import InputError, ResourceError
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.location import Location
 from mudg.base.processes import child_environment, process_pool, run_in_processes
 from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_log import LogClipRules, LogSource, LogWindow
+from mudg.data.clips.shards import ShardSource
+from mudg.data.clips.sources import ShardCache, StreamedShards
 from mudg.data.scene import read_scene
 from mudg.models.diffusion import sized_to_area
 from mudg.models.mdm.codec import CLASSES
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import city_fits
+from mudg.stages.learning.scene_list import ListedShards, is_list, read_list
+
+CACHE = "cache"
+"""Where in the output folder clips are kept that are fetched or made when they are needed, while training runs."""
 
 
 def held_out_cities(config: LearnConfig) -> list[int]:
@@ -101,8 +108,10 @@ def _stop_all_on_error(futures: list[concurrent.futures.Future[int]]) -> Any:
     return stop
 
 
-def await_shard(folder: Path, city: int, patience_s: float = 900.0) -> None:
-    """Wait until a shard is there (it is being made by another process)."""
+def await_shard(folder: Path | ShardSource, city: int, patience_s: float = 900.0) -> None:
+    """Wait until a shard is there (it is being made by another process). One of another source is brought when it is read."""
+    if not isinstance(folder, Path):
+        return
     path = clip_shards.shard_path(folder, city)
     started = time.monotonic()
     while not path.is_file():
@@ -168,8 +177,10 @@ def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) 
     return replace(config, data=data, score=replace(config.score, watched=min(config.score.watched, max(1, scored))))
 
 
-def scored_shards(config: LearnConfig) -> list[int]:
+def scored_shards(config: LearnConfig, folder: Path | ShardSource) -> list[int]:
     """Numbers of the shards to score: the held-out ones, or the first one trained on where nothing was held out."""
+    if isinstance(folder, ListedShards):
+        return folder.scored()
     return [0] if config.data.scenes and not config.data.held_out_every else held_out_cities(config)
 
 
@@ -181,6 +192,75 @@ def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
         f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where they were\n"
         f"recorded, with {given} as condition. Depth was learned where a sweep measured it. The model this\n"
         f"one continues from has training data of its own. `held-out` below means every {config.data.held_out_every}. window of these logs."
+    )
+
+
+# clips that are fetched or made when they are needed ------------------------------------------------------------------
+
+
+def clips_at_address(config: LearnConfig) -> bool:
+    """Whether the setting `clips` is an address in an object store."""
+    return bool(config.data.clips) and Location.of(config.data.clips).local is None
+
+
+def is_streamed(config: LearnConfig) -> bool:
+    """Whether clips are not all in one folder of this machine before training starts.
+
+    Raises:
+        UsageError: settings that do not go together.
+    """
+    listed, remote = is_list(config.data.scenes), clips_at_address(config)
+    if remote and config.data.scenes:
+        raise UsageError("logs and clips at an address are given", where="--data.scenes, --data.clips", got=config.data.clips,
+                         remedy="leave one out; a list of scenes may name folders of clips at addresses")  # fmt: skip
+    if listed and config.data.clips:
+        raise UsageError("a list of scenes says where the clips are", where="--data.clips", got=config.data.clips,
+                         remedy="leave it out; --compute.cache chooses where clips that were made or fetched are kept")  # fmt: skip
+    return listed or remote
+
+
+def open_streamed(
+    config: LearnConfig, out: Path, multiple: int, points_alone: bool
+) -> tuple[LearnConfig, StreamedShards | ListedShards]:
+    """The clips at the address of `clips` or of the listed scenes, and the configuration with the size that they have."""
+    cache = ShardCache(Path(config.compute.cache) if config.compute.cache else out / CACHE, int(config.compute.cache_gb * 1e9))
+    if not config.data.scenes:
+        return config, StreamedShards(Location.of(config.data.clips), cache, config.data.clips_per_city)
+    data = config.data
+    if not points_alone:
+        data = replace(data, width=round(data.width / multiple) * multiple, height=round(data.height / multiple) * multiple)
+    rules = LogClipRules(
+        width=data.width, height=data.height, window=data.window, stride=data.stride, frame_step=data.frame_step,
+        cameras=data.cameras, held_out_every=0, label_confidence=data.label_confidence, seed=config.seed, published=points_alone,
+    )  # fmt: skip
+    scenes = read_list(data.scenes[0], data.held_out)
+    log.info(f"learn: {data.scenes[0]}: {scenes.summary()}")
+    return replace(config, data=data), ListedShards(scenes, cache, rules, data.bad_scenes)
+
+
+def weighed_shards(config: LearnConfig, folder: Path | ShardSource) -> Sequence[int]:
+    """Shards over which classes are counted: the first cities, or some that are drawn from a list, where classes are balanced."""
+    if not isinstance(folder, ListedShards):
+        return cities_in_use(config, 0)[:20]
+    count = 20 if config.loss.class_balance else 0
+    return [folder.draw(seeds.numpy_rng(config.seed, n, "class weights"), _with_clips(folder)) for n in range(count)]
+
+
+def _with_clips(folder: ListedShards) -> Callable[[int], int]:
+    def take(number: int) -> int:
+        folder.clips_in(number)
+        return number
+
+    return take
+
+
+def describe_list(config: LearnConfig, shards: ListedShards) -> str:
+    """A sentence on the training data for the model card."""
+    shares = ", ".join(f"{name} {100 * share:.3g} %" for name, share in list(shards.scenes.shares.items())[:20])
+    return (
+        f"clips of {config.data.window} frames of {len(shards.scenes.scenes)} listed scenes at "
+        f"{config.data.width}x{config.data.height} pixels\n"
+        f"({shares}). {len(shards.scenes.scored)} scenes were held out for scoring."
     )
 
 
@@ -207,13 +287,29 @@ def _of_same_size(city: int, first: int, sizes: list[tuple[int, int]], cities: r
 
 
 def draw_clips(
-    config: LearnConfig, folder: Path, step: int, count: int, frames: int, purpose: str, part: slice | None = None
+    config: LearnConfig, folder: Path | ShardSource, step: int, count: int, frames: int, purpose: str, part: slice | None = None
 ) -> list[Clip]:
     """The clips of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
 
     What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of `count`, and not on which
-    `part` of that batch is drawn here. All clips of a step have one size: that of its first clip.
+    `part` of that batch is drawn here, nor on where the shards come from. All clips of a step have one size: that of its first clip.
     """
+    places = range(count)[part or slice(None)]
+    if isinstance(folder, ListedShards):
+        return [_varied(config, _listed_clip(config, folder, (step, place, purpose), frames), step, place, purpose) for place in places]
+    picks, sizes = _picks(config, folder, step, count, frames, purpose), sizes_of_cities(config)
+    clips = []
+    for place in places:
+        clip = clip_shards.read_clip(folder, *picks[place])
+        _refuse_size(clip, sizes[picks[place][0] % len(sizes)], folder, picks[place][0])
+        clips.append(_varied(config, clip, step, place, purpose))
+    return clips
+
+
+def _picks(
+    config: LearnConfig, folder: Path | ShardSource, step: int, count: int, frames: int, purpose: str
+) -> list[tuple[int, int, range]]:
+    """Shard, clip and frames for every place of a batch."""
     rng = seeds.numpy_rng(config.seed, step, purpose)
     picks: list[tuple[int, int, range]] = []
     sizes, cities = sizes_of_cities(config), cities_in_use(config, step)
@@ -224,29 +320,93 @@ def draw_clips(
         number = int(rng.integers(clip_shards.clips_in(folder, city)))
         start = int(rng.integers(config.data.window - frames + 1))
         picks.append((city, number, range(start, start + frames)))
-    clips = []
-    for place in range(count)[part or slice(None)]:
-        clip = clip_shards.read_clip(folder, *picks[place])
-        width, height = sizes[picks[place][0] % len(sizes)]
-        if clip.rgb.shape[-2:] != (height, width):
-            raise InputError(
-                "the training clips have another size", where=str(clip_shards.shard_path(folder, picks[place][0])),
-                expected=f"{width}x{height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
-                remedy="choose another --data.clips",
-            )  # fmt: skip
-        if config.data.augment:
-            clip = clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))
-        clips.append(clip)
-    return clips
+    return picks
 
 
-def have_patches(folder: Path, city: int = 0) -> bool:
+def _listed_clip(config: LearnConfig, folder: ListedShards, place: tuple[int, int, str], frames: int) -> Clip:
+    """The clip of a listed scene for (step, place in the batch, purpose). A scene of another size is a bad one."""
+    step, number, purpose = place
+    chosen, start = seeds.numpy_rng(config.seed, step, f"{purpose}, frames {number}").random(2).tolist()
+
+    def take(shard: int) -> Clip:
+        clip = int(chosen * clip_shards.clips_in(folder, shard))
+        first = int(start * (config.data.window - frames + 1))
+        found = clip_shards.read_clip(folder, shard, clip, range(first, first + frames))
+        _refuse_size(found, (config.data.width, config.data.height), folder, shard)
+        return found
+
+    return folder.draw(seeds.numpy_rng(config.seed, step, f"{purpose}, scene {number}"), take)
+
+
+def _refuse_size(clip: Clip, size: tuple[int, int], folder: Path | ShardSource, shard: int) -> None:
+    width, height = size
+    if clip.rgb.shape[-2:] != (height, width):
+        raise InputError(
+            "the training clips have another size",
+            where=str(clip_shards.shard_path(folder, shard)) if isinstance(folder, Path) else f"shard {shard}",
+            expected=f"{width}x{height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}", remedy="choose another --data.clips",
+        )  # fmt: skip
+
+
+def _varied(config: LearnConfig, clip: Clip, step: int, place: int, purpose: str) -> Clip:
+    if not config.data.augment:
+        return clip
+    return clip_shards.vary(clip, seeds.numpy_rng(config.seed, step, f"{purpose}, clip {place}"))
+
+
+def bring_shards(
+    config: LearnConfig, folder: Path | ShardSource, step: int, count: int, frames: int, parts: Sequence[slice]
+) -> None:
+    """Fetch or make the shards that a process needs for its `parts` of a step, so that drawing them need not wait."""
+    if isinstance(folder, Path):
+        return
+    places = [place for part in parts for place in range(count)[part]]
+    if isinstance(folder, ListedShards):
+        for place in places:
+            folder.draw(seeds.numpy_rng(config.seed, step, f"batch, scene {place}"), folder.clips_in)
+        return
+    picks = _picks(config, folder, step, count, frames, "batch")
+    for place in places:
+        folder.reading(picks[place][0], lambda path: None)
+
+
+class ReadingAhead:
+    """Threads that bring the shards of the next steps while a step is computed. What fails there fails again when it is drawn.
+
+    Args:
+        bring: brings the shards of a step.
+        depth: so many steps ahead. 0: nothing is brought.
+        steps: of the training.
+    """
+
+    def __init__(self, bring: Callable[[int], None], depth: int, steps: int) -> None:
+        self._bring, self._depth, self._steps, self._next = bring, depth, steps, 0
+        self._pool = concurrent.futures.ThreadPoolExecutor(min(4, depth)) if depth else None
+
+    def __enter__(self) -> ReadingAhead:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def beyond(self, step: int) -> None:
+        """Begin with what is missing for the steps after `step`."""
+        self._next = max(self._next, step + 1)
+        while self._pool is not None and self._next <= min(step + self._depth, self._steps - 1):
+            self._pool.submit(self._bring, self._next)
+            self._next += 1
+
+
+def have_patches(config: LearnConfig, folder: Path | ShardSource, city: int = 0) -> bool:
     """Whether the clips have patches at a higher resolution; seen in the first one of a city."""
+    if isinstance(folder, ListedShards):
+        return _listed_clip(config, folder, (0, 0, "patches"), 1).fine is not None
     await_shard(folder, city)
     return clip_shards.read_clip(folder, city, 0, range(1)).fine is not None
 
 
-def class_weights(folder: Path, cities: Iterable[int], balance: float) -> Tensor:
+def class_weights(folder: Path | ShardSource, cities: Iterable[int], balance: float) -> Tensor:
     """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some cities.
 
     Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.

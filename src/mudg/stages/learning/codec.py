@@ -14,6 +14,7 @@ from mudg.base.errors import ResourceError
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip
 from mudg.core import losses
+from mudg.data.clips.shards import ShardSource
 from mudg.models.mdm.codec import Modality, PatchCodec
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning.clips import draw_clips
@@ -27,7 +28,7 @@ FIT_IMAGES = 8
 
 
 def train_codec(
-    codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path, bf16: bool, device: torch.device = CPU
+    codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, device: torch.device = CPU
 ) -> None:
     """Fit the linear parts on the first cities of `folder`, on the CPU, then train the decoder on noisy latents, on a device."""
     steps, out, alone = config.codec.steps, run_dir.path / "codec", Ranks(0, 1, device)
@@ -60,7 +61,7 @@ def train_codec(
                 state.save(out, alone, {})
 
 
-def _fitted(like: PatchCodec, config: LearnConfig, folder: Path) -> PatchCodec:
+def _fitted(like: PatchCodec, config: LearnConfig, folder: Path | ShardSource) -> PatchCodec:
     """A codec on the CPU with weights drawn and its linear parts fitted."""
     codec = PatchCodec(like.config)
     draw_weights(codec, config.seed, "codec weights")

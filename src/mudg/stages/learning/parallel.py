@@ -3,8 +3,9 @@
 Started by `torchrun`, every process runs the same program. They meet in a process group (gloo on CPUs, nccl on CUDA
 devices) and differ only in their number, the rank. Rank 0 leads: it alone makes clips, writes logs and pictures, and scores.
 
-Three layouts give the same losses up to rounding: one process; `ddp`, a whole copy of the network per process; `fsdp`,
-parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`).
+Four layouts give the same losses up to rounding: one process; `ddp`, a whole copy of the network per process; `fsdp`,
+parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`); `hsdp`, the same
+pieces within each group of processes, usually a node, and whole replicas of the network in all groups.
 
 What processes tell each other is numbers and JSON text. Nothing is pickled.
 """
@@ -39,7 +40,7 @@ SAME_SIGNAL_S = 2.0
 PARTING_S = 0.5
 """Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that; one that comes
 when the interpreter is already shutting down aborts the process, after all the work is done and saved."""
-Layout = Literal["ddp", "fsdp"]
+Layout = Literal["ddp", "fsdp", "hsdp"]
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def _ranks_on_device(rank: int, size: int, wanted: str) -> Ranks:
 class Spread:
     """A model in one of the layouts: call `network` as the model itself, in `portion` for each portion of a step."""
 
-    def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout) -> None:
+    def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout, per_replica: int = 0) -> None:
         self.network = model
         self._sharded: list[nn.Module] = []
         if ranks.size == 1:
@@ -202,7 +203,11 @@ class Spread:
         from torch.distributed.device_mesh import init_device_mesh
         from torch.distributed.fsdp import fully_shard
 
-        mesh = init_device_mesh(ranks.device.type, (ranks.size,))
+        if layout == "hsdp":
+            shape = mesh_shape(ranks, per_replica)
+            mesh = init_device_mesh(ranks.device.type, shape, mesh_dim_names=("replica", "shard"))
+        else:
+            mesh = init_device_mesh(ranks.device.type, (ranks.size,))
         for part in trained.values():
             _stored_plainly(part)
             for block in blocks(part):
@@ -218,6 +223,21 @@ class Spread:
         holds = isinstance(self.network, nn.parallel.DistributedDataParallel) and not last
         with self.network.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
             yield
+
+
+def mesh_shape(ranks: Ranks, per_replica: int) -> tuple[int, int]:
+    """Replicas of the network, and the processes over which each is sharded; 0: those that the launcher started on this node.
+
+    Raises:
+        UsageError: the processes cannot be divided so.
+    """
+    text = os.environ.get("LOCAL_WORLD_SIZE", "")
+    size = per_replica or (int(text) if text.isdecimal() else 0) or ranks.size
+    if ranks.size % size:
+        raise UsageError("the processes cannot be divided into replicas", where="--compute.processes-per-replica",
+            expected=f"a divisor of {ranks.size} processes", got=str(size),
+            remedy="give the number of processes of a node, the same on all")  # fmt: skip
+    return ranks.size // size, size
 
 
 def blocks(part: nn.Module) -> list[nn.Module]:
@@ -276,15 +296,29 @@ def first_row(value: Tensor) -> int:
     """Which row of the whole tensor `local(value)` begins with."""
     if not is_sharded(value):
         return 0
-    from torch.distributed.tensor.placement_types import Shard
+    axis = _shard_axis(value)
+    mesh = value.device_mesh  # type: ignore[attr-defined]
+    per_rank = -(-value.shape[0] // mesh.size(axis))
+    return min(value.shape[0], per_rank * mesh.get_local_rank(axis))
 
-    (placement,) = value.placements  # type: ignore[attr-defined]
-    if placement != Shard(0):
-        raise ResourceError(
-            "a tensor is sharded in a way that checkpoints do not support", expected="Shard(0)", got=str(placement)
-        )
-    per_rank = -(-value.shape[0] // value.device_mesh.size())  # type: ignore[attr-defined]
-    return min(value.shape[0], per_rank * value.device_mesh.get_local_rank())  # type: ignore[attr-defined]
+
+def is_copy(value: Tensor) -> bool:
+    """Whether another process, of a replica before this one, holds the same piece of a sharded tensor."""
+    if not is_sharded(value):
+        return False
+    axis, mesh = _shard_axis(value), value.device_mesh  # type: ignore[attr-defined]
+    return any(mesh.get_local_rank(n) > 0 for n in range(mesh.ndim) if n != axis)
+
+
+def _shard_axis(value: Tensor) -> int:
+    """The axis of the mesh over which a tensor's rows are divided; over all others it is replicated."""
+    from torch.distributed.tensor.placement_types import Replicate, Shard
+
+    placements = list(value.placements)  # type: ignore[attr-defined]
+    if placements.count(Shard(0)) != 1 or any(p not in (Shard(0), Replicate()) for p in placements):
+        raise ResourceError("a tensor is sharded in a way that checkpoints do not support", expected="Shard(0), or replicas of it",
+                            got=str(placements))  # fmt: skip
+    return placements.index(Shard(0))
 
 
 def clip_gradients(part: nn.Module, limit: float) -> float:

@@ -40,7 +40,7 @@ SCORES = (
 def score(
     model: MDM | PublishedMDM,
     cities: Sequence[int],
-    folder: Path,
+    folder: Path | clip_shards.ShardSource,
     request: SampleRequest,
     *,
     prepare: Callable[[Clip], Clip] | None = None,

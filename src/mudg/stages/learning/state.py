@@ -4,7 +4,7 @@ Every process writes the rows of each tensor that it holds to a safetensors file
 
     steps/step_00000100/
         net.0000.safetensors  net.0000.json     weights: rank 0's rows; name -> shape of the whole tensor, first row
-        net.0001.safetensors  net.0001.json     rank 1's, only if parameters were sharded
+        net.0001.safetensors  net.0001.json     rank 1's, only if parameters were sharded; of several replicas the first one's
         average.*  exp_avg.*  exp_avg_sq.*      moving average and AdamW's moments, in the same way
         state.json  manifest.json               step, seed, layout; SHA-256 of every file
 
@@ -15,6 +15,7 @@ that processes exchange are pickled still. Nothing that is read back here may ex
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ from torch import Tensor, nn
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import InputError, IntegrityError
-from mudg.stages.learning.parallel import Ranks, first_row, gathered, is_sharded, local
+from mudg.stages.learning.parallel import Ranks, first_row, gathered, is_copy, is_sharded, local
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -72,17 +73,19 @@ class TrainingState:
         state = {names[id(p)]: held for p, held in self.optimizer.state.items()}
         return {kind: {name: held[kind] for name, held in state.items()} for kind in MOMENTS}
 
-    def save(self, folder: Path, ranks: Ranks, facts: Mapping[str, Any], keep: int = 2) -> None:
-        """Write a checkpoint of the present step; all processes take part, on a file system that all see."""
+    def save(self, folder: Path, ranks: Ranks, facts: Mapping[str, Any], keep: int = 2) -> float:
+        """Write a checkpoint of the present step; all processes take part, on a file system that all see. Returns the seconds it took."""
+        began = time.monotonic()
         weights = self.trained.state_dict()
         groups = {"net": weights, **self._moments()}
         if self.average is not None:
             groups["average"] = self.average
         partial = checkpoint.partial_path(folder, self.step)
         sharded = any(map(is_sharded, weights.values()))
+        writes = ranks.leads or (sharded and not any(map(is_copy, weights.values())))
 
         def write_own() -> None:
-            if ranks.leads or sharded:
+            if writes:
                 for name, tensors in groups.items():
                     write_rows(partial, name, ranks.rank, tensors)
 
@@ -90,11 +93,12 @@ class TrainingState:
             ranks.wait()
             ranks.all_do(write_own)
             ranks.wait()
-            return
+            return time.monotonic() - began
         with checkpoint.writing(folder, self.step, {**facts, "processes": ranks.size, "sharded": sharded}, keep):
             ranks.wait()
             ranks.all_do(write_own)
         ranks.wait()
+        return time.monotonic() - began
 
     def resume(self, folder: Path, ranks: Ranks) -> bool:
         """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""

@@ -1,0 +1,123 @@
+"""Training under torchrun whose processes are killed, warned and changed in number: the losses of an uninterrupted run."""
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from toy_clips import HEIGHT, WIDTH, WINDOW, write_clips
+
+from mudg.base import checkpoint
+from mudg.base.errors import UsageError
+from mudg.stages.learning.parallel import Ranks, mesh_shape
+
+pytestmark = pytest.mark.slow
+SAME = 1e-6
+"""Relative."""
+STEPS = 8
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return write_clips(tmp_path_factory.mktemp("clips"))
+
+
+def losses_of(out):
+    """Of each step; of one that was repeated after a restart, the last."""
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return {row["step"]: row["total"] for row in rows if "total" in row}
+
+
+def start(processes, clips, out, fault="", restarts=0, **changes):
+    flags = {
+        "out": out, "steps": STEPS, "data.clips": clips, "data.cities": 3, "data.first-cities": 2, "data.held-out": 1,
+        "data.width": WIDTH, "data.height": HEIGHT, "data.window": WINDOW, "data.clips-per-city": 2, "network.widths": "16 32",
+        "network.blocks": "1 1", "network.spatial-attention": "False True", "network.temporal-attention": "False True",
+        "network.refine-widths": "8 16", "network.refine-blocks": "1 1", "network.finish-widths": "8 16", "network.finish-blocks": "1 1",
+        "codec.steps": 2, "codec.batch": 2, "codec.fit-batches": 1, "optimizer.batch-frames": 16, "optimizer.warmup-steps": 1,
+        "score.steps": 1, "score.every": 100, "precision": "float32", "compute.workers": 0, "compute.log-every": 1,
+        "compute.checkpoint-every": 2, "compute.checkpoints-kept": 3, **changes,
+    }  # fmt: skip
+    words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
+    here = Path(__file__).parent
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--nnodes", "1", "--rdzv-backend", "c10d", "--rdzv-endpoint", "127.0.0.1:0",
+        "--nproc-per-node", str(processes), "--max-restarts", str(restarts), str(here / "learn_on_nodes.py"), "learn", *words,
+    ]  # fmt: skip
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(here), *sys.path]), "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1", "FAULT": fault,
+    }  # fmt: skip
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+
+
+def test_two_processes_then_one_then_four(clips, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    done = start(1, clips, whole)
+    assert done.returncode == 0, done.stderr
+    said = []
+    done = start(2, clips, parts, "kill:3:1", restarts=1, **{"steps": STEPS, "compute.parallel": "fsdp"})
+    # killed in step 4, resumed after step 2; stopped below by giving up after it finished is no option, so it goes to the end here
+    assert done.returncode == 0 and "resuming at step 2" in done.stderr + done.stdout, done.stderr
+    assert max_difference(whole, parts) < SAME
+
+    parts = tmp_path / "changed"
+    for processes, fault, changes in (
+        (2, "warn:2:1", {"compute.parallel": "fsdp"}),
+        (1, "warn:4:0", {}),
+        (4, "", {"compute.parallel": "hsdp", "compute.processes-per-replica": 2}),
+    ):
+        done = start(processes, clips, parts, fault, **changes)
+        said.append(done.stdout + done.stderr)
+        assert (done.returncode == 0) is (not fault), done.stderr
+        if fault:
+            assert "143" in said[-1], said[-1]
+    assert [re.findall(r"resuming at step (\d+)", text) for text in said] == [[], ["3"], ["5"]]
+    times = re.findall(r"checkpoint of step (\d+) in ([\d.]+) s", "\n".join(said))
+    print("checkpoints:", times, f"largest relative difference of a loss: {max_difference(whole, parts):.1e}")
+    assert {step for step, _ in times} == {"2", "3", "4", "5", "6", "8"}
+    assert max_difference(whole, parts) < SAME
+    kept = sorted(p.name for p in (parts / "steps").iterdir())
+    assert kept == ["step_00000005", "step_00000006", "step_00000008"]
+    newest = checkpoint.latest(parts / "steps")
+    assert newest is not None and newest.state["processes"] == 4
+    assert len(list(newest.path.glob("net.*.safetensors"))) == 2  # of one replica
+
+
+def max_difference(one, other):
+    first, second = losses_of(one), losses_of(other)
+    assert set(first) == set(second) == set(range(1, STEPS + 1))
+    return max(abs(first[step] - second[step]) / abs(first[step]) for step in first)
+
+
+def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
+    """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes of everything."""
+    here, sums = Path(__file__).parent, {}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),
+        "GLOO_SOCKET_IFNAME": "lo",
+        "OMP_NUM_THREADS": "1",
+    }
+    before = ""
+    for processes, layout in ((1, "fsdp"), (2, "fsdp"), (4, "fsdp"), (4, "hsdp"), (2, "fsdp"), (1, "fsdp")):
+        into = tmp_path / f"{len(sums)}"
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes),
+                   str(here / "reshard_together.py"), layout, before, str(into)]  # fmt: skip
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        sums[into] = done.stdout.split()[-1]
+        before = str(into)
+    assert len(set(sums.values())) == 1 and len(hashlib.sha256().hexdigest()) == len(next(iter(sums.values())))
+
+
+def test_replicas_divide_the_processes(monkeypatch):
+    ranks = Ranks(0, 8, torch.device("cpu"))
+    assert mesh_shape(ranks, 2) == (4, 2) and mesh_shape(ranks, 8) == (1, 8)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert mesh_shape(ranks, 0) == (2, 4)
+    with pytest.raises(UsageError, match="divisor of 8"):
+        mesh_shape(ranks, 3)

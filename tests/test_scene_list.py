@@ -1,0 +1,242 @@
+"""Lists of scenes and streamed clips: what is drawn, what is kept, what is left out."""
+
+import collections
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from toy_clips import tiny, write_clips
+
+from mudg.base import seeds, store
+from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.location import Location
+from mudg.data.clips.sources import FolderOfShards, ShardCache, StreamedShards
+from mudg.stages import learn
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.learning.scene_list import ListedScene, ListedShards, SceneList, is_list, read_list
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return write_clips(tmp_path_factory.mktemp("clips") / "clips")
+
+
+@pytest.fixture(scope="module")
+def address(clips, tmp_path_factory):
+    """The clips in the object store that lives in memory."""
+    place = Location.of(f"memory://{tmp_path_factory.mktemp('bucket').name}/clips")
+    place.push(clips)
+    return place
+
+
+def losses_of(out):
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return {row["step"]: row["total"] for row in rows if "total" in row}
+
+
+def rng(step):
+    return seeds.numpy_rng(0, step, "test")
+
+
+# lists ----------------------------------------------------------------------------------------------------------------
+
+
+def test_scenes_are_drawn_by_the_weights_of_their_data_sets():
+    scenes = [ListedScene(path=f"a{n}", data_set="a") for n in range(30)]
+    scenes += [ListedScene(path="b0", data_set="b"), ListedScene(path="b1", data_set="b", weight=3.0)]
+    scenes += [ListedScene(path="c", data_set="c", weight=0.0), ListedScene(path="h", data_set="b", held_out=True)]
+    listed = SceneList(scenes, {"a": 1.0, "b": 3.0}, 5, "list")
+    assert listed.shares == {"a": 0.25, "b": 0.75} and listed.scored == [33]
+    count = 6000
+    drawn = collections.Counter(listed.draw(rng(n)) for n in range(count))
+    assert set(drawn) == set(range(32))  # neither the one without weight nor the held-out one
+    wanted = np.array([0.25 / 30] * 30 + [0.75 / 4, 0.75 * 3 / 4]) * count
+    got = np.array([drawn[n] for n in range(32)])
+    assert ((got - wanted) ** 2 / wanted).sum() < 61.1  # chi-square, 31 degrees of freedom: 0.999
+    assert [listed.draw(rng(7)) for _ in range(3)] == [listed.draw(rng(7))] * 3
+
+
+def test_without_weights_every_scene_counts_the_same():
+    scenes = [ListedScene(path=str(n), data_set="ab"[n > 2]) for n in range(12)]
+    listed = SceneList(scenes, {}, 0, "list")
+    assert listed.shares == {"a": 0.25, "b": 0.75} and listed.scored == []
+    assert SceneList(scenes, {}, 2, "x").scored == SceneList([*scenes, scenes[0]], {}, 2, "x").scored  # by path alone
+    assert "12 scenes" in listed.summary() and "75 % of the clips" in listed.summary()
+
+
+def test_lists_are_read_in_three_formats(tmp_path):
+    (tmp_path / "l.yaml").write_text(
+        "data_sets: {k: 2.0}\nscenes:\n- a\n- {path: b, data_set: k, weight: 2, held_out: true}\n- {path: c, data_set: k}\n"
+    )
+    (tmp_path / "l.json").write_text('["a", {"path": "b", "data_set": "k"}]')
+    (tmp_path / "l.txt").write_text("# scenes\na\nb\tk\t2.5\n\n")
+    a, b, c = (read_list(str(tmp_path / f"l.{end}")) for end in ("yaml", "json", "txt"))
+    assert a.shares == {"scenes": 1 / 3, "k": 2 / 3} and a.scored == [1]
+    assert [s.path for s in b.scenes] == ["a", "b"] and c.scenes[1].weight == 2.5
+    assert is_list([str(tmp_path / "l.txt")]) and not is_list(["runs/a"]) and not is_list([])
+    for content, words in (
+        ("[]", "scenes"),
+        ('[{"path": "a", "wieght": 1}]', "did you mean 'weight'"),
+        ('{"data_sets": {"x": 1}, "scenes": ["a"]}', "without scenes"),
+        ('[{"path": "a", "weight": 0}]', "no scene"),
+    ):
+        (tmp_path / "bad.json").write_text(content)
+        with pytest.raises(InputError, match=words):
+            read_list(str(tmp_path / "bad.json"))
+    (tmp_path / "bad.txt").write_text("a\tb\tmuch\n")
+    with pytest.raises(InputError, match="line 1"):
+        read_list(str(tmp_path / "bad.txt"))
+
+
+def listed_folder(clips, tmp_path, count=6, bad=()):
+    """A list of folders with one shard each; `bad`: missing ones."""
+    entries = []
+    for n in range(count):
+        folder = tmp_path / "scenes" / f"{n}"
+        if n not in bad:
+            folder.mkdir(parents=True)
+            shutil.copy(clips / f"city_{n % 3:07d}.safetensors", folder / "city_0000000.safetensors")
+        entries.append({"path": str(folder), "data_set": "ab"[n % 2], "held_out": n == 0})
+    store.write_json(tmp_path / "list.json", {"scenes": entries, "data_sets": {"a": 1.0, "b": 2.0}})
+    return str(tmp_path / "list.json")
+
+
+def from_list(text, **changes):
+    return tiny("", scenes=(text,), **{"log_every": 1, "checkpoint_every": 1, "steps": 2, **changes})
+
+
+def test_bad_scenes_are_left_out_up_to_a_limit(clips, tmp_path, capsys):
+    text = listed_folder(clips, tmp_path, bad=(3,))
+    (tmp_path / "scenes" / "4" / "city_0000000.safetensors").write_bytes(b"damaged")
+    config = from_list(text, bad_scenes=0.4)
+
+    def opened(limit=0.4):
+        _, shards = learn_clips.open_streamed(from_list(text, bad_scenes=limit), tmp_path / "out", 8, False)
+        return shards
+
+    one, knowing = opened(), opened()
+    first = [clip.rgb for step in range(12) for clip in learn_clips.draw_clips(config, one, step, 2, 2, "batch")]
+    assert {n // 100_000_000 for n in one.bad} == {3, 4}
+    said = capsys.readouterr().err
+    assert said.count("scenes/3") >= 1 and said.count("left out") == 2
+    [learn_clips.draw_clips(config, knowing, step, 2, 2, "batch") for step in range(12)]
+    again = [clip.rgb for step in range(12) for clip in learn_clips.draw_clips(config, knowing, step, 2, 2, "batch")]
+    assert all(map(torch.equal, first, again))  # what was known before changes nothing
+    parts = [learn_clips.draw_clips(config, opened(), 5, 4, 2, "batch", slice(n, n + 1))[0].rgb for n in range(4)]
+    assert all(map(torch.equal, parts, [c.rgb for c in learn_clips.draw_clips(config, one, 5, 4, 2, "batch")]))
+    with pytest.raises(UsageError, match="too many scenes"):
+        [learn_clips.draw_clips(config, opened(0.2), step, 2, 2, "batch") for step in range(40)]
+
+
+def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
+    text = listed_folder(clips, tmp_path)
+    learn.run(from_list(text), tmp_path / "whole")
+    draw = learn.draw_clips
+
+    def stopped_by_the_user(config, folder, step, *rest):
+        if step == 1:
+            raise KeyboardInterrupt
+        return draw(config, folder, step, *rest)
+
+    monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
+    with pytest.raises(KeyboardInterrupt):
+        learn.run(from_list(text), tmp_path / "parts")
+    monkeypatch.setattr(learn, "draw_clips", draw)
+    learn.run(from_list(text), tmp_path / "parts")
+    assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "parts")
+    names = [p.name for p in (tmp_path / "whole" / "model").glob("*.safetensors")]
+    assert names and all(
+        (tmp_path / "whole" / "model" / n).read_bytes() == (tmp_path / "parts" / "model" / n).read_bytes()
+        for n in names
+    )
+    assert not (tmp_path / "whole" / "cache").exists()
+    with pytest.raises(UsageError, match="--out"):
+        learn.run(from_list(text), tmp_path / "scenes" / "1" / "out")
+    with pytest.raises(UsageError, match="list of scenes says"):
+        learn.run(tiny(clips, scenes=(text,)), tmp_path / "both")
+
+
+# streamed clips -------------------------------------------------------------------------------------------------------
+
+
+def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
+    learn.run(tiny(clips, log_every=1, steps=2), tmp_path / "local")
+    learn.run(tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6), tmp_path / "streamed")
+    assert losses_of(tmp_path / "local") == losses_of(tmp_path / "streamed")
+    assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1  # all others had to go
+    assert json.loads((tmp_path / "local" / "metrics.json").read_text()) == json.loads(
+        (tmp_path / "streamed" / "metrics.json").read_text()
+    )
+
+
+def test_the_least_recently_used_clips_leave_the_cache(tmp_path):
+    cache = ShardCache(tmp_path, 250)
+
+    def get(name, when):
+        path = cache.get(f"{name}.safetensors", lambda at: store.atomic_write(at, bytes(100)))
+        os.utime(path, ns=(when, when))
+        return {p.stem for p in tmp_path.glob("*.safetensors")}
+
+    assert [get("a", 1), get("b", 2), get("a", 3)][-1] == {"a", "b"} and cache.made == 2
+    assert get("c", 4) == {"a", "c"}
+    assert get("b", 5) == {"b", "c"} and cache.made == 4
+    small = ShardCache(tmp_path / "small", 10)
+    assert small.get("x.safetensors", lambda at: store.atomic_write(at, bytes(100))).is_file()
+
+
+def test_what_arrives_is_verified(clips, address, tmp_path):
+    folder = FolderOfShards.open(address)
+    assert folder.numbers()[:3] == (0, 1, 2) and len(folder.sums) == 4
+    folder.bring(1, tmp_path / "one")
+    assert (tmp_path / "one").read_bytes() == (clips / "city_0000001.safetensors").read_bytes()
+    with pytest.raises(IntegrityError, match="not what was uploaded"):
+        FolderOfShards(address, {**folder.sums, "city_0000001.safetensors": "0" * 64}).bring(1, tmp_path / "two")
+    assert not (tmp_path / "two").exists()
+    with pytest.raises(InputError, match="another number of clips(.|\n)*clips-per-city 2"):
+        StreamedShards(address, ShardCache(tmp_path / "c", 10**9), 5).path(0)
+    inner = FolderOfShards.open(Location.of(f"{address}"))
+    assert inner.key == folder.key
+
+
+def test_reading_ahead_brings_what_will_be_drawn(address, tmp_path):
+    config = tiny(address.text)
+    shards = StreamedShards(address, ShardCache(tmp_path, 10**9), 2)
+    with learn_clips.ReadingAhead(
+        lambda step: learn_clips.bring_shards(config, shards, step, 4, 2, [slice(0, 4)]), 2, 4
+    ) as ahead:
+        ahead.beyond(0)
+        ahead._pool.shutdown(wait=True)
+        brought = len(list(tmp_path.rglob("*.safetensors")))
+    assert brought >= 1
+    for step in (1, 2):
+        learn_clips.draw_clips(config, shards, step, 4, 2, "batch")
+    assert len(list(tmp_path.rglob("*.safetensors"))) == brought
+
+
+def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
+    """Made once; how many clips there are is not counted again."""
+    from mudg.data.clips import from_log
+    from mudg.stages.learning import scene_list
+
+    calls = collections.Counter()
+    windows = [from_log.LogWindow("front", ("a",), False)] * 3
+    monkeypatch.setattr(scene_list.from_log, "log_source", lambda text: from_log.LogSource(tmp_path, tmp_path))
+    monkeypatch.setattr(scene_list.store, "digest", lambda path: "content")
+    monkeypatch.setattr(scene_list, "read_scene", lambda path: calls.update(["scene"]))
+    monkeypatch.setattr(scene_list.from_log, "log_windows", lambda scene, rules: windows)
+
+    def write_log(source, rules, chosen, folder):
+        calls.update(["write"])
+        for number, _ in chosen:
+            store.atomic_write(folder / f"city_{number:07d}.safetensors", b"x")
+
+    monkeypatch.setattr(scene_list.from_log, "write_log", write_log)
+    scenes = SceneList([ListedScene(path="log=fused")], {}, 0, "list")
+    make = lambda: ListedShards(scenes, ShardCache(tmp_path / "cache", 10**9), from_log.LogClipRules(48, 32), 0.0)  # noqa: E731
+    shards = make()
+    assert len(shards.opened(0).shards) == 3 and calls == {"scene": 1}
+    assert shards.path(2).is_file() and shards.path(1).is_file() and calls == {"scene": 2, "write": 1}
+    assert make().path(3).is_file() and calls["write"] == 1
