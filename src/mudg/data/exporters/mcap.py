@@ -34,14 +34,14 @@ class McapDialect:
 
     Args:
         profile: of the file. schema_encoding, message_encoding: names of the specification. schemas: text of every schema by its name.
-        metadata: topic -> what its channel carries beside.
+        beside: what the channel of a topic carries beside.
     """
 
     profile: str
     schema_encoding: str
     message_encoding: str
     schemas: Mapping[str, str]
-    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    beside: Callable[[str], Mapping[str, str]] = lambda _topic: {}
 
 
 def _text(value: str) -> bytes:
@@ -88,7 +88,9 @@ class McapBlocks:
             channel = self._channel(message)
             moment, content = message.nanoseconds, message.content()
             number = self._counts[channel] = self._counts.get(channel, 0) + 1
-            chunk.add(channel, moment, _op(_MESSAGE, struct.pack("<HIQQ", channel, number - 1, moment, moment) + content))
+            chunk.add(
+                channel, moment, _op(_MESSAGE, struct.pack("<HIQQ", channel, number - 1, moment, moment) + content)
+            )
             if chunk.size >= CHUNK_BYTES:
                 yield self._chunk(chunk)
                 chunk = _Chunk()
@@ -131,7 +133,7 @@ class McapBlocks:
 
     def _beside(self, topic: str) -> bytes:
         """The metadata of a channel."""
-        pairs = b"".join(_text(key) + _text(value) for key, value in self._dialect.metadata.get(topic, {}).items())
+        pairs = b"".join(_text(key) + _text(value) for key, value in self._dialect.beside(topic).items())
         return struct.pack("<I", len(pairs)) + pairs
 
     def _chunk(self, chunk: _Chunk) -> bytes:

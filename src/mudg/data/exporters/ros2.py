@@ -84,9 +84,7 @@ ONCE: Final = frozenset({"/tf_static", "/ego/path", "/points"})
 def dialect() -> McapDialect:
     """How these messages stand in a file."""
     schemas = {_type(name): DEFINITIONS.schema(name) for name in SENT}
-    return McapDialect(
-        "ros2", "ros2msg", "cdr", schemas, {topic: {"offered_qos_profiles": _qos(topic)} for topic in ONCE}
-    )
+    return McapDialect("ros2", "ros2msg", "cdr", schemas, lambda topic: {"offered_qos_profiles": _qos(topic)})
 
 
 def metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -> bytes:

@@ -86,8 +86,9 @@ def run(
     given = _opened(source, scene, edits, name in FORMATS)
     refuse_overlap(out, {"scene": given.parts.scene, **given.named})
     if cameras or name == "ros2":
-        folder = RunDir.open(out, _FOLDER if cameras else BAG, {**result_settings(config), "format": name}, given.inputs, overwrite)
-        return _cameras(name, given, folder) if cameras else write_bag(records_of(_known(given), _points(given)), folder)
+        recorded, settings = _known(given), {**result_settings(config), "format": name}
+        folder = RunDir.open(out, _FOLDER if cameras else BAG, settings, given.inputs, overwrite)
+        return _cameras(name, given, recorded, folder) if cameras else write_bag(records_of(recorded, _points(given)), folder)
     _refuse_name(out, name, overwrite)
     if name in MESSAGES:
         return _messages(config, name, given, Path(out))
@@ -225,9 +226,8 @@ def _count(scene: SplatScene) -> int:
 # -- cameras -------------------------------------------------------------------------------------------------------------
 
 
-def _cameras(name: str, given: Exported, folder: RunDir) -> Path:
+def _cameras(name: str, given: Exported, recorded: Scene, folder: RunDir) -> Path:
     """A folder of cameras, pictures and starting points."""
-    recorded = _known(given)
     if folder.complete:
         return folder.reused()
     names = picture_names(recorded)
