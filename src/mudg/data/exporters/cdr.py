@@ -24,7 +24,7 @@ _FIELD: Final = re.compile(r"([A-Za-z][\w/]*)(\[(\d*)\])? ([a-z]\w*)")
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class CdrField:
     """One field: its type, its name, and how often it stands there (None: once; -1: any number, stated before; else fixed)."""
 
     kind: str
@@ -75,7 +75,7 @@ class Definitions:
         for field in fields:
             self._value(out, field, value.get(field.name))
 
-    def _value(self, out: bytearray, field: Field, value: Any) -> None:
+    def _value(self, out: bytearray, field: CdrField, value: Any) -> None:
         if field.count is None:
             self._one(out, field.kind, value)
             return
@@ -103,12 +103,12 @@ class Definitions:
             self._record(out, kind, value or {})
 
 
-def _field(line: str, where: str) -> Field:
+def _field(line: str, where: str) -> CdrField:
     found = _FIELD.fullmatch(line.strip())
     if found is None:
         raise ValueError(f"{where}: not a field: {line!r}")
     kind, several, count, name = found.groups()
-    return Field(kind, name, None if several is None else int(count) if count else -1)
+    return CdrField(kind, name, None if several is None else int(count) if count else -1)
 
 
 def _number(out: bytearray, code: str, value: float) -> None:

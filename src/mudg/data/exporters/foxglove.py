@@ -72,7 +72,7 @@ DIALECT: Final = McapDialect(
 
 
 @dataclass(frozen=True, slots=True)
-class _Planned:
+class _JsonMessage:
     """One message before it is made: its topic, the name of its schema, seconds on the log's clock, and what makes its value."""
 
     topic: str
@@ -94,7 +94,7 @@ class FoxgloveMessages:
     def __iter__(self) -> Iterator[McapMessage]:
         found = [*self._of_cameras(), *self._of_sweeps(), *self._of_objects()]
         if self._log.fused is not None:
-            found.append(_Planned("/points", "foxglove.PointCloud", self._log.start_s, self._fused_points))
+            found.append(_JsonMessage("/points", "foxglove.PointCloud", self._log.start_s, self._fused_points))
         for one in sorted(found, key=lambda message: (message.time_s, message.topic)):
             yield McapMessage(one.topic, one.schema, self._log.nanoseconds(one.time_s), one.content)
 
@@ -102,39 +102,39 @@ class FoxgloveMessages:
         nanoseconds = self._log.nanoseconds(time_s)
         return {"sec": nanoseconds // NANO, "nsec": nanoseconds % NANO}
 
-    def _of_cameras(self) -> Iterator[_Planned]:
+    def _of_cameras(self) -> Iterator[_JsonMessage]:
         for frame in self._scene.frames:
             name, view = frame.view.camera.name, frame.view
-            yield _Planned("/tf", "foxglove.FrameTransforms", view.time_s, lambda v=view: self._transforms(v.time_s, [
+            yield _JsonMessage("/tf", "foxglove.FrameTransforms", view.time_s, lambda v=view: self._transforms(v.time_s, [
                 (f"camera/{v.camera.name}", v.world_from_cam)]))  # fmt: skip
-            yield _Planned(
+            yield _JsonMessage(
                 f"/camera/{name}/calibration",
                 "foxglove.CameraCalibration",
                 view.time_s,
                 lambda v=view: self._calibration(v),
             )
-            yield _Planned(
+            yield _JsonMessage(
                 f"/camera/{name}/image", "foxglove.CompressedImage", view.time_s, lambda f=frame: self._image(f)
             )
 
-    def _of_sweeps(self) -> Iterator[_Planned]:
+    def _of_sweeps(self) -> Iterator[_JsonMessage]:
         for sweep in self._scene.sweeps:
             place = [(f"lidar/{sweep.sensor}", sweep.world_from_lidar)]
-            yield _Planned(
+            yield _JsonMessage(
                 "/tf", "foxglove.FrameTransforms", sweep.time_s, lambda s=sweep, p=place: self._transforms(s.time_s, p)
             )
-            yield _Planned(
+            yield _JsonMessage(
                 f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, lambda s=sweep: self._sweep(s)
             )
 
-    def _of_objects(self) -> Iterator[_Planned]:
+    def _of_objects(self) -> Iterator[_JsonMessage]:
         for moment in self._log.moments():
-            yield _Planned("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
+            yield _JsonMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
-                yield _Planned("/ego", "foxglove.PoseInFrame", moment, lambda t=moment, p=pose: {
+                yield _JsonMessage("/ego", "foxglove.PoseInFrame", moment, lambda t=moment, p=pose: {
                     "timestamp": self._stamp(t), "frame_id": "world", "pose": _pose(p)})  # fmt: skip
-                yield _Planned(
+                yield _JsonMessage(
                     "/tf",
                     "foxglove.FrameTransforms",
                     moment,

@@ -142,7 +142,7 @@ def ros_names(names: Iterable[str]) -> dict[str, str]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Planned:
+class _CdrMessage:
     """One message before it is made: topic, type, seconds on the log's clock, and what makes its value."""
 
     topic: str
@@ -184,31 +184,31 @@ class Ros2Messages:
         kind, name = sensor.partition("/")[0], self._names[sensor]
         return f"camera_{name}_optical" if kind == "camera" else f"lidar_{name}"
 
-    def _once(self) -> Iterator[_Planned]:
+    def _once(self) -> Iterator[_CdrMessage]:
         start = self._log.start_s
         if self._mounts:
-            yield _Planned("/tf_static", "tf2_msgs/TFMessage", start, lambda: {"transforms": [
+            yield _CdrMessage("/tf_static", "tf2_msgs/TFMessage", start, lambda: {"transforms": [
                 self._transform(start, VEHICLE, self._frame(name), mount) for name, mount in self._mounts.items()]})  # fmt: skip
         ego = self._scene.ego
-        yield _Planned("/ego/path", "nav_msgs/Path", start, lambda: {"header": self._header(start, MAP), "poses": [
+        yield _CdrMessage("/ego/path", "nav_msgs/Path", start, lambda: {"header": self._header(start, MAP), "poses": [
             {"header": self._header(float(t), MAP), "pose": _pose(pose)} for t, pose in zip(ego.times_s, ego.world_from_ego)]})  # fmt: skip
         if self._log.fused is not None:
-            yield _Planned("/points", "sensor_msgs/PointCloud2", start, self._fused)
+            yield _CdrMessage("/points", "sensor_msgs/PointCloud2", start, self._fused)
 
-    def _transforms(self) -> Iterator[_Planned]:
+    def _transforms(self) -> Iterator[_CdrMessage]:
         """The vehicle at every moment at which something was recorded, and sensors that are not fixed to it."""
         for moment in self._log.moments():
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
                 yield self._tf(moment, VEHICLE, pose)
-                yield _Planned("/ego/pose", "geometry_msgs/PoseStamped", moment, lambda t=moment, p=pose: {
+                yield _CdrMessage("/ego/pose", "geometry_msgs/PoseStamped", moment, lambda t=moment, p=pose: {
                     "header": self._header(t, MAP), "pose": _pose(p)})  # fmt: skip
         for sensor, time_s, pose in self._log.sensor_poses():
             if sensor not in self._mounts:
                 yield self._tf(time_s, self._frame(sensor), pose)
 
-    def _tf(self, time_s: float, frame: str, pose: NDArray[np.float64]) -> _Planned:
-        return _Planned(
+    def _tf(self, time_s: float, frame: str, pose: NDArray[np.float64]) -> _CdrMessage:
+        return _CdrMessage(
             "/tf", "tf2_msgs/TFMessage", time_s, lambda: {"transforms": [self._transform(time_s, MAP, frame, pose)]}
         )
 
@@ -217,18 +217,18 @@ class Ros2Messages:
         return {"header": self._header(time_s, parent), "child_frame_id": child,
                 "transform": {"translation": told["position"], "rotation": told["orientation"]}}  # fmt: skip
 
-    def _of_sensors(self) -> Iterator[_Planned]:
+    def _of_sensors(self) -> Iterator[_CdrMessage]:
         for frame in self._scene.frames:
             topic, view = f"/camera/{self._names[f'camera/{frame.view.camera.name}']}", frame.view
-            yield _Planned(
+            yield _CdrMessage(
                 f"{topic}/camera_info", "sensor_msgs/CameraInfo", view.time_s, lambda v=view: self._camera_info(v)
             )
-            yield _Planned(
+            yield _CdrMessage(
                 f"{topic}/image/compressed", "sensor_msgs/CompressedImage", view.time_s, lambda f=frame: self._image(f)
             )
         for sweep in self._scene.sweeps:
             topic = f"/lidar/{self._names[f'lidar/{sweep.sensor}']}/points"
-            yield _Planned(topic, "sensor_msgs/PointCloud2", sweep.time_s, lambda s=sweep: self._sweep(s))
+            yield _CdrMessage(topic, "sensor_msgs/PointCloud2", sweep.time_s, lambda s=sweep: self._sweep(s))
 
     def _camera_info(self, view: View) -> dict[str, Any]:
         camera = view.camera
@@ -269,12 +269,12 @@ class Ros2Messages:
         return {"header": self._header(time_s, frame), "height": 1, "width": len(rows), "fields": fields, "point_step": rows.dtype.itemsize,
                 "row_step": len(content), "data": content, "is_dense": True}  # fmt: skip
 
-    def _of_objects(self) -> Iterator[_Planned]:
+    def _of_objects(self) -> Iterator[_CdrMessage]:
         for moment in self._log.moments():
-            yield _Planned(
+            yield _CdrMessage(
                 "/objects/markers", "visualization_msgs/MarkerArray", moment, lambda t=moment: self._markers(t)
             )
-            yield _Planned(
+            yield _CdrMessage(
                 "/objects/detections", "vision_msgs/Detection3DArray", moment, lambda t=moment: self._detections(t)
             )
 
