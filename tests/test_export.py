@@ -421,7 +421,7 @@ def text_of(content: bytes, place: int) -> tuple[str, int]:
 
 
 def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg.data.exporters import mcap
+    from mudg.data.exporters import foxglove, mcap
 
     monkeypatch.setattr(mcap, "CHUNK_BYTES", 20_000)  # several chunks
     street = ToyStreet(times=[0.5, 0.6, 0.7], car_start=(8.0, 1.0), car_velocity=(3.0, 0.0))
@@ -459,7 +459,7 @@ def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkey
     sweep = next(value for topic, values in found.items() if topic.startswith("/lidar/") for value in values)
     assert sweep["point_stride"] == 16 and len(base64.b64decode(sweep["data"])) % 16 == 0
     assert found["/objects"][1]["entities"][0]["cubes"][0]["size"]["x"] == pytest.approx(4.0)
-    known = {name: set(schema["properties"]) for name, schema in mcap.SCHEMAS.items()}
+    known = {name: set(schema["properties"]) for name, schema in foxglove.SCHEMAS.items()}
     assert set(found["/objects"][0]) == known["foxglove.SceneUpdate"] and set(sweep) == known["foxglove.PointCloud"]
     statistics = [body for _, code, body in records(content, summary, offsets) if code == 11]
     assert struct.unpack_from("<QHII", statistics[0])[0] == len(times)

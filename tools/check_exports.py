@@ -5,7 +5,7 @@
 RUN: a fit, or the folder of a finished `mudg run`. FOLDER gets the files. Programs, each checked only where it is found:
 
     npm install @playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10    reads and writes SPZ, SOG, ...; rules of glTF
-    pip install usd-core mcap                                                       rules of USD; messages
+    pip install usd-core mcap rosbags rerun-sdk                                     rules of USD; messages, bags, recordings
 
 Prints one line per file and program; the exit code is the number of failures.
 """
@@ -27,6 +27,7 @@ from mudg.data.splats.cloud import SplatCloud
 from mudg.data.splats.formats import FORMATS, read_cloud
 from mudg.stages.config import ExportConfig
 from mudg.stages.exporting import export
+from mudg.stages.exporting.messages import SUFFIXES
 
 SINGLE = ("ply", "spz", "compressed-ply", "sog", "splat")
 STEP_M = {"spz": 0.001, "ply": 1e-4, "compressed-ply": 0.02, "sog": 0.02, "splat": 1e-4}
@@ -57,6 +58,9 @@ def main() -> int:
         failures += report(f"{name} by usd-core", of_usd(files[name]) if importlib.util.find_spec("pxr") else None)
     has_mcap = importlib.util.find_spec("mcap") is not None and "mcap" in files
     failures += report("mcap by mcap", of_mcap(files["mcap"]) if has_mcap else None)
+    has_bags = importlib.util.find_spec("rosbags") is not None and "ros2" in files
+    failures += report("ros2 by rosbags", of_bag(files["ros2"]) if has_bags else None)
+    failures += report("rerun by rerun-sdk", of_recording(files["rerun"]) if "rerun" in files else None)
     return failures
 
 
@@ -69,12 +73,13 @@ def report(title: str, problem: str | None) -> int:
 def written(run: Path, out: Path) -> dict[str, Path]:
     """All files of a run, one moment for formats without motion."""
     found = {}
-    for name in (*SINGLE, "glb", "usda", "usdz", "mcap"):
-        suffix = ".mcap" if name == "mcap" else FORMATS[name].suffixes[0]
-        found[name] = out / f"scene{suffix}"
-        if name == "mcap" and not (run / "scene").is_dir():
-            del found[name]
+    for name in (*SINGLE, "glb", "usda", "usdz", *SUFFIXES):
+        suffix = (SUFFIXES.get(name) or "_bag") if name in SUFFIXES else FORMATS[name].suffixes[0]
+        if name in ("mcap", "ros2") and not (run / "scene").is_dir():
             continue
+        if name == "rerun" and importlib.util.find_spec("rerun") is None:
+            continue
+        found[name] = out / f"scene{suffix}"
         export.run(ExportConfig(), name, run, found[name], overwrite=True)
     return found
 
@@ -161,6 +166,34 @@ def of_mcap(file: Path) -> str:
     if summary is None or summary.statistics.message_count != len(times) or times != sorted(times):
         return "the messages are not those of the summary"
     return ""
+
+
+def of_bag(folder: Path) -> str:
+    """Whether every message is read with the types of two releases, and written again to the same bytes."""
+    from rosbags.rosbag2 import Reader  # type: ignore[import-not-found]
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # type: ignore[import-not-found]
+
+    for release in (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY):
+        types, count = get_typestore(release), 0
+        with Reader(folder) as reader:
+            for connection, _, raw in reader.messages():
+                if connection.msgtype not in types.fielddefs:  # vision_msgs: by the definition in the file
+                    types.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+                value = types.deserialize_cdr(raw, connection.msgtype)
+                if bytes(types.serialize_cdr(value, connection.msgtype)) != bytes(raw):
+                    return f"{release.name}: {connection.topic} reads differently"
+                count += 1
+            if count != reader.message_count:
+                return f"{release.name}: {count} messages of {reader.message_count}"
+    return ""
+
+
+def of_recording(file: Path) -> str:
+    """Whether the recording is read, and what a viewer needs is in it."""
+    from rerun.chunk import RrdReader  # type: ignore[import-not-found]
+
+    paths = {chunk.entity_path for chunk in RrdReader(file).stream().to_chunks()}
+    return "" if any(path.startswith("/world/gaussians/") for path in paths) else f"no Gaussians in {sorted(paths)[:5]}"
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
 cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
-messages:   OUT.mcap
+messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2)
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from mudg.base.versions import version
 from mudg.core.sh import C0
 from mudg.data.cloudfile import read_fused
 from mudg.data.exporters.colmap import colmap_files
-from mudg.data.exporters.mcap import LogMessages, McapBlocks
 from mudg.data.exporters.nerfstudio import nerfstudio_files
 from mudg.data.exporters.pictures import picture_names, pictures
-from mudg.data.scene import read_points, read_scene
-from mudg.data.scene.files import open_files
+from mudg.data.scene import read_scene
 from mudg.data.splats.cloud import SplatScene
 from mudg.data.splats.formats import FORMATS, WriteRequest, file_from_world, losses
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import ExportConfig
 from mudg.stages.editing.carried import carry_out, read_and_digest
 from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.exporting.messages import BAG, Told, records_of, refuse_missing, write_bag, write_file
+from mudg.stages.exporting.messages import SUFFIXES as MESSAGES
 from mudg.stages.exporting.scenes import splat_scene, with_sky_sphere
 from mudg.stages.fitting.storage import load_model, model_of_scene
 
@@ -43,7 +43,6 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
     "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
 }  # fmt: skip
 """Formats of cameras: files beside the pictures."""
-MESSAGES: Final = "mcap"
 MOST_POINTS: Final = 500_000
 _FOLDER = VerbOutput("export", 1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
 
@@ -77,19 +76,22 @@ def run(
     Raises:
         UsageError: an unknown format, or a setting that it does not have. InputError: nothing that can be exported.
     """
-    if name not in FORMATS and name not in CAMERAS and name != MESSAGES:
-        known = ", ".join((*FORMATS, *CAMERAS, MESSAGES))
+    if name not in FORMATS and name not in CAMERAS and name not in MESSAGES:
+        known = ", ".join((*FORMATS, *CAMERAS, *MESSAGES))
         raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
     cameras = name in CAMERAS
     refuse_overlap(out, {"run": source, "scene": scene, "edits": edits})
     _refuse_settings(config, name)
+    refuse_missing(name)
     given = _opened(source, scene, edits, name in FORMATS)
     refuse_overlap(out, {"scene": given.parts.scene, **given.named})
-    if cameras:
-        return _cameras(config, name, given, out, overwrite)
+    if cameras or name == "ros2":
+        recorded, settings = _known(given), {**result_settings(config), "format": name}
+        folder = RunDir.open(out, _FOLDER if cameras else BAG, settings, given.inputs, overwrite)
+        return _cameras(name, given, recorded, folder) if cameras else write_bag(records_of(recorded, _points(given)), folder)
     _refuse_name(out, name, overwrite)
-    if name == MESSAGES:
-        return _messages(given, Path(out))
+    if name in MESSAGES:
+        return _messages(config, name, given, Path(out))
     request = requested(config, name, given)
     content = FORMATS[name].write(request)
     _written(out, name, config, request, content, given.inputs)
@@ -119,7 +121,7 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
 
 
 def _refuse_name(out: Path, name: str, overwrite: bool) -> None:
-    suffixes = (".mcap",) if name == MESSAGES else FORMATS[name].suffixes
+    suffixes = (MESSAGES[name],) if name in MESSAGES else FORMATS[name].suffixes
     if not Path(out).name.lower().endswith(suffixes):
         expected = f"a name that ends in {' or '.join(suffixes)}"
         raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
@@ -224,10 +226,8 @@ def _count(scene: SplatScene) -> int:
 # -- cameras -------------------------------------------------------------------------------------------------------------
 
 
-def _cameras(config: ExportConfig, name: str, given: Exported, out: Path, overwrite: bool) -> Path:
+def _cameras(name: str, given: Exported, recorded: Scene, folder: RunDir) -> Path:
     """A folder of cameras, pictures and starting points."""
-    recorded = _known(given)
-    folder = RunDir.open(out, _FOLDER, {**result_settings(config), "format": name}, given.inputs, overwrite)
     if folder.complete:
         return folder.reused()
     names = picture_names(recorded)
@@ -246,18 +246,13 @@ def _cameras(config: ExportConfig, name: str, given: Exported, out: Path, overwr
     return folder.path
 
 
-def _messages(given: Exported, out: Path) -> Path:
-    """The log as messages over time."""
-    recorded = _known(given)
-    files = open_files(recorded.root)
-    messages = LogMessages(
-        recorded, lambda frame: files.read(frame.image.path), lambda sweep: read_points(recorded, sweep), _points(given)
-    )
-    store.write_blocks(out, McapBlocks(messages, f"mudg {version()}"))
-    log.info(
-        f"export: {len(recorded.frames)} pictures, {len(recorded.sweeps)} sweeps, {out.stat().st_size / 1e6:.2f} MB in {out}"
-    )
-    return out
+def _messages(config: ExportConfig, name: str, given: Exported, out: Path) -> Path:
+    """The log as messages over time, in a file."""
+    if name != "rerun":
+        return write_file(name, Told(records_of(_known(given), _points(given))), out)
+    splats = None if given.model is None else splat_scene(given.model, middle_s(given.model, given.log))
+    records = None if given.log is None else records_of(_known(given), _points(given) if splats is None else None)
+    return write_file(name, Told(records, splats), out)
 
 
 def _known(given: Exported) -> Scene:
