@@ -148,7 +148,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
             ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16, ranks.device))
             learn_codec.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
-        for name in ("refiner", "finisher"):
+        for name in ("refiner", "finisher", "effects"):
             part = getattr(model, name, None)
             if name in fresh and part is not None:
                 draw_weights(part, config.seed, f"{name} weights")
@@ -229,7 +229,7 @@ def _train_network(
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
     weights = _class_weights(config, folder).to(ranks.device)
-    settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)
+    settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout, config.data.effect_dropout)
     board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []

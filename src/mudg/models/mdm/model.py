@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette, seeds
+from mudg.base.effects import EFFECTS
 from mudg.base.errors import UsageError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Clip, Condition
@@ -51,6 +52,7 @@ from mudg.models.mdm.codec import (
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
+from mudg.models.mdm.effects import Effects, Tuning
 from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles, with_detail
 from mudg.models.mdm.network import (
     ConditionPixels,
@@ -76,7 +78,8 @@ class ConditionLatents:
     planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
     [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
     trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of models that use
-    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
+    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w]. effect: of models that take effect vectors, these,
+    [B,8]; None: no clip has one.
     """
 
     planes: Tensor
@@ -86,6 +89,7 @@ class ConditionLatents:
     pixels: ConditionPixels
     render: dict[Modality, Tensor] = field(default_factory=dict)
     certainty: Tensor | None = None
+    effect: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,13 @@ class LossSettings:
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
+    effect_dropout     share of the clips that go without their effect vector; the small kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
+    effect_dropout: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -181,6 +187,11 @@ class MDM(nn.Module):
         if config.finish_widths:
             (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
             self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
+        self.effects: Effects | None = None
+        if config.effects:
+            refined = [] if self.refiner is None else self.refiner.block_sides
+            self.effects = Effects(config.embed_width, self.net.block_sides, refined, config.effects)
+            self.effects.to(memory_format=torch.channels_last)
 
     @property
     def device(self) -> torch.device:
@@ -218,15 +229,15 @@ class MDM(nn.Module):
         far = self.codec.encode_rgb(given.backdrop)
         masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
         planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
-        pixels = self._pixels_of(given)
+        pixels, effect = self._pixels_of(given), None if self.effects is None else given.effect
         if not self.config.renders:
-            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
+            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, effect=effect)
         shown = given.renders
         render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
         classes, certainty = _cell_shares(shown.semantics), _cell_means(shown.certainty, factor)
         alpha = _cell_means(shown.alpha, factor)
         planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
-        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty)
+        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty, effect)
 
     def _pixels_of(self, given: _Stacked) -> ConditionPixels:
         """What the refiner sees of a batch of conditions, [B*T,..]."""
@@ -249,7 +260,11 @@ class MDM(nn.Module):
         Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
         """
         sizes = [x[m].shape[2] for m in MODALITIES]
-        out, gates = self.net(torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), t).split(
+        given, effect = torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), None
+        if self.effects is not None and encoded.effect is not None:
+            features = self.effects.features(encoded.effect)
+            effect = self.effects.time(features), Tuning(self.effects.net, features.repeat_interleave(given.shape[1], 0))
+        out, gates = self.net(given, t, effect).split(
             [sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2
         )
         copy_rgb, copy_depth, copy_far, copy_classes, *copy_render = gates.split(1, 2)
@@ -274,7 +289,7 @@ class MDM(nn.Module):
         With a refiner its terms are added, and their gradient reaches the denoiser.
         """
         with torch.no_grad():
-            encoded = self.encode_condition([clip.condition for clip in clips])
+            encoded = self._some_without_effect(self.encode_condition([clip.condition for clip in clips]), part, settings)
             truth = self.encode_truth(clips)
         generator = seeds.torch_generator(part.seed, part.step, "noise")
         steps = noise.stratified_steps(part.count, len(self.schedule), generator)
@@ -296,6 +311,15 @@ class MDM(nn.Module):
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)  # type: ignore[arg-type]
+
+    @staticmethod
+    def _some_without_effect(encoded: ConditionLatents, part: BatchPart, settings: LossSettings) -> ConditionLatents:
+        """The conditions, a share of them (by clip, see `BatchPart`) without their effect vector."""
+        if encoded.effect is None or not settings.effect_dropout:
+            return encoded
+        draws = [seeds.numpy_rng(part.seed, part.step, f"effect, clip {part.first + n}").random() for n in range(len(encoded.effect))]
+        kept = torch.tensor([draw >= settings.effect_dropout for draw in draws], device=encoded.effect.device)
+        return replace(encoded, effect=encoded.effect * kept[:, None])
 
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
@@ -338,7 +362,7 @@ class MDM(nn.Module):
         latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
         factor = self.codec.factor
         tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
-        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
+        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames, encoded.effect)
         return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
 
     def _finisher_terms(
@@ -351,7 +375,7 @@ class MDM(nn.Module):
         frames = stated["rgb"].shape[1]
         latents = {m: z.flatten(0, 1).detach() for m, z in stated.items()}
         with torch.no_grad():
-            small = self._made(self.refine(latents, encoded.pixels, frames))
+            small = self._made(self.refine(latents, encoded.pixels, frames, encoded.effect))
             enlarged = []
             for number, patch in patches:
                 (h, w), (height, width) = stated["rgb"].shape[-2:], patch.clip.rgb.shape[-2:]
@@ -397,15 +421,21 @@ class MDM(nn.Module):
             spans.append(slice(start, start + size))
         return spans[0], spans[1]
 
-    def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
-        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
+    def refine(
+        self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int, effect: Tensor | None = None
+    ) -> Refined:
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`); `effect` [B,8] of the clips."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
-        return self.refiner(self.codec, latents, given, frames)
+        tuning = None
+        if self.effects is not None and effect is not None:
+            tuning = Tuning(self.effects.refine, self.effects.features(effect).repeat_interleave(frames, 0))
+        return self.refiner(self.codec, latents, given, frames, tuning)
 
     def trained_part(self) -> nn.ModuleDict:
-        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner and finisher."""
-        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher}
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner, finisher and
+        effects."""
+        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher, "effects": self.effects}
         return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
@@ -458,7 +488,7 @@ class MDM(nn.Module):
                 decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
-                made = self._made(self.refine(latents, encoded.pixels, len(condition.views)))
+                made = self._made(self.refine(latents, encoded.pixels, len(condition.views), encoded.effect))
                 decoded, log_error = self._decoded(made), made.log_error
                 confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
                 if request.n_samples > 1:
@@ -547,6 +577,7 @@ class _Stacked:
     ids: Tensor
     backdrop_ids: Tensor
     renders: RenderPlanes
+    effect: Tensor | None
 
     @classmethod
     def of(cls, batch: Sequence[Condition]) -> _Stacked:
@@ -560,7 +591,16 @@ class _Stacked:
             torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
             torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
             RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
+            _effects_of(batch),
         )
+
+
+def _effects_of(batch: Sequence[Condition]) -> Tensor | None:
+    """Effect vectors [B,8], zeros for a clip without one; None where none has any, or only zeros."""
+    if all(c.effect is None or not bool(c.effect.any()) for c in batch):
+        return None
+    nothing = torch.zeros(len(EFFECTS), device=batch[0].color.device)
+    return torch.stack([nothing if c.effect is None else c.effect for c in batch])
 
 
 def _cell_means(mask: Tensor, factor: int) -> Tensor:

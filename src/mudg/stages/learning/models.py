@@ -70,7 +70,7 @@ def kind_of(model: nn.Module) -> ModelKind:
 
 
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
-    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
+    """The model to train, and which of its parts ("codec", "refiner", "finisher", "effects") have no weights yet.
 
     With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
     ask for them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
@@ -83,7 +83,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     wanted = model_config(config)
     can_grow = config.data.renders and not config.data.scenes
     if not config.start:
-        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
+        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher", "effects"}
     if is_published(config.start):
         if not _network_is_default(config):
             raise UsageError("the shape of a published-type network cannot be changed", where="--start",
@@ -93,13 +93,16 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     if before.config.window != config.data.window:
         log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
     wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
-    resized = model_of_window(before, config.data.window, wanted.area_px)
+    wanted = replace(wanted, effects=wanted.effects or before.config.effects)
+    if config.frozen == "all_but_effects":  # the rest of the model stays what it is
+        wanted = replace(wanted, window=before.config.window, area_px=before.config.area_px)
+    resized = model_of_window(before, wanted.window, wanted.area_px)
     if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
         log.info("learn: the network has the shape of --start")
         wanted = resized.config
     if wanted == resized.config:
         return resized, set()
-    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
+    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher), ("effects", before.effects)) if had is None}
     return extended(resized, wanted), grown
 
 
@@ -161,6 +164,11 @@ def freeze(model: Model, what: str) -> int:
         names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
         if not isinstance(model, MDM) or model.refiner is None:
             raise UsageError("without a refiner nothing is left to train", where="--frozen", got=what)
+    elif what == "all_but_effects":
+        if not isinstance(model, MDM) or model.effects is None:
+            raise UsageError("the model takes no effect vector, so nothing is left to train", where="--frozen", got=what,
+                             remedy="give --network.effects 16")  # fmt: skip
+        names = {name for name, _ in model.trained_part().named_parameters() if not name.startswith(mdm_files.EFFECTS_PREFIX)}
     else:
         names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
     count = 0
