@@ -132,6 +132,12 @@ def clips_in(folder: Path, city: int) -> int:
         return int(shard.get_slice("shift_m").get_shape()[0])
 
 
+def frames_in(folder: Path, city: int) -> int:
+    """Frames of each clip in a shard."""
+    with _open(shard_path(folder, city)) as shard:
+        return int(shard.get_slice("rgb").get_shape()[1])
+
+
 def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
     try:
         return safe_open(str(store.regular(path)), "numpy")

@@ -4,7 +4,8 @@ A condition is edited as views are (`core.weather`): the colours of what was see
 depth and classes; then it says so in its effect vector. Its geometry and classes stay.
 
 `pairs_of` makes training clips: the condition of a clear day, edited so, and the same city generated in that weather. Rain and snow that
-fall are drawn over the generated image by the formulas of the edit, but from exact depth, light and camera response: the city has none.
+fall, and the vehicle's headlights, are put into the generated image by the formulas of the edit, but from exact depth, normals, albedo,
+light and camera response: the city has none.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from torch import Tensor
 from mudg.base import palette, seeds
 from mudg.base.effects import effect_vector
 from mudg.base.types import Condition, View
-from mudg.base.weather_settings import Conditions
+from mudg.base.weather_settings import Conditions, LightSettings, WeatherSettings
 from mudg.core import trajectory, weather
-from mudg.core.weather import DriveFacts, ShownView
-from mudg.core.weather.gbuffer import from_render
+from mudg.core.weather import DriveFacts, ShownView, relight
+from mudg.core.weather.gbuffer import GBuffer, Surroundings, from_render
 from mudg.core.weather.tone import SRGB
 from mudg.data.city import CityConfig, CityTruth, CityWorld
 from mudg.data.city.weather import city_light
+from mudg.data.city.world import CitySurfaces
 from mudg.data.clips.condition import RenderAt
 
 SKY: Final = palette.ID["sky"]
@@ -110,6 +112,8 @@ def draw_pair(kind: str, rng: np.random.Generator, clear: CityConfig) -> Weather
         cover = uniform(0.4, 1)
         sky["weather"]["snow"] = {"cover": cover, "mm_h": uniform(0.5, 3) if rng.random() < 0.5 else 0.0, "tracks": 1.0}
         changes["snow_cover"] = cover
+    if kind == "night" and rng.random() < 0.6:
+        sky["light"]["headlights"] = True
     if light:
         changes["light"] = sky["light"]["time"] = light
     if light == "dusk":
@@ -147,25 +151,34 @@ def pairs_of(
         pair = draw_pair(KINDS[(key + number) % len(KINDS)], rng, world.config)
         how = InWeather(pair.settings, drive, world.config.seed, lambda time_s: trajectory.velocity(world.ego_path(), time_s))
         there = CityWorld(replace(world.config, **pair.changes))
-        truths = [_with_falling(there, there.render(view), view, how) for view in condition.views]
+        truths = [_completed(there, there.render(view), view, how) for view in condition.views]
         made.append((weathered(condition, how), truths, pair))
     return made
 
 
-def _with_falling(world: CityWorld, truth: CityTruth, view: View, how: InWeather) -> CityTruth:
-    """The truth with rain and snow in the air, if the weather has any."""
-    asked = how.settings.weather
+def _completed(world: CityWorld, truth: CityTruth, view: View, how: InWeather) -> CityTruth:
+    """The truth with what the city has none of: rain and snow in the air, headlights."""
+    asked, light = how.settings.weather, how.settings.light
     rain, snow = asked.rain, None if asked.snow is None or not asked.snow.mm_h else asked.snow.model_copy(update={"cover": 0.0})
-    if rain is None and snow is None:
+    headlights = light.time == "night" and light.headlights
+    if rain is None and snow is None and not headlights:
         return truth
-    light = city_light(world.config, world.lamps)
-    curve = light.response.curve()
-    falling = how.settings.model_copy(
-        update={"weather": asked.model_copy(update={"fog": None, "wet": 0.0, "rain": rain, "snow": snow}),
-                "light": how.settings.light.model_copy(update={"time": "as_recorded"})}
-    )  # fmt: skip
+    around = city_light(world.config, world.lamps)
+    curve = around.response.curve()
     gbuffer = from_render(view, curve.decode(truth.rgb), truth.depth, truth.semantics)
     gbuffer = replace(gbuffer, camera_velocity=how.velocity_at(view.time_s))
-    made = weather.apply(gbuffer, falling, view, view.time_s, how.seed, light.surroundings)
+    if headlights:
+        gbuffer = replace(gbuffer, color=_with_headlights(gbuffer, world.surfaces(view), view, light))
+    falling = Conditions(weather=WeatherSettings(rain=rain, snow=snow), response=how.settings.response)
+    made = weather.apply(gbuffer, falling, view, view.time_s, how.seed, around.surroundings)
     shown: NDArray[np.float32] = curve.encode(made.color).astype(np.float32)
     return replace(truth, rgb=np.clip(shown, 0, 1))
+
+
+def _with_headlights(gbuffer: GBuffer, exact: CitySurfaces, view: View, light: LightSettings) -> NDArray[np.float32]:
+    """Linear light f32[H,W,3] with that of the vehicle's headlights on exact surfaces."""
+    alone = light.model_copy(update={"lamps": False})
+    surfaces = replace(gbuffer, normal=exact.normal)
+    nothing = Surroundings(*(np.zeros(3) for _ in range(3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    added = exact.albedo * relight.night_lights(surfaces, view, nothing, alone)
+    return (gbuffer.color + np.where(gbuffer.sky[..., None], 0, added)).astype(np.float32)

@@ -102,7 +102,8 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         wanted = resized.config
     if wanted == resized.config:
         return resized, set()
-    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher), ("effects", before.effects)) if had is None}
+    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
+    grown |= {"effects"} if wanted.effects != before.config.effects else set()
     return extended(resized, wanted), grown
 
 
