@@ -90,7 +90,7 @@ class CityClipRules:
     textures: str = ""
     """Varied cities: folder of photographic textures and skies, used by most cities (empty = none)."""
     weathers: int = 0
-    """With `fitted`: every clip this often, each time in other weather or light (`weathered.py`), of a city on a clear day; 0 = as it is."""
+    """With `fitted`: every clip this often, each time in other weather or light (`weathered.py`), of cities on clear days; 0 = as it is."""
 
     @property
     def frames(self) -> int:

@@ -205,8 +205,8 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %. Clips in other weather keep their colours: they are what is learned. Given classes: see `ClassMistakes`. A mirrored clip keeps its
-    poses and intrinsics: they then describe the mirror image of the place.
+    +-8 %; the condition gets a further exposure error of +-3 %. Clips in other weather keep their colours, which are what is learned.
+    Given classes: see `ClassMistakes`. A mirrored clip keeps its poses and intrinsics: they then describe the mirror image of the place.
 
     Args:
         clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way.

@@ -58,8 +58,8 @@ class LearnData:
     """Generated cities: what the model is given. freevs: as FreeVS, coloured LiDAR points of two frames before and after each view, without
     depth, recorded images, classes and renders; use the model with `mudg synthesize --condition freevs`."""
     weathers: int = Field(default=0, ge=0)
-    """Generated cities, with renders: use every clip this often, each time edited to other weather or light, with the city generated in that
-    weather as truth (0 = as it is). For models that take an effect vector (`--network.effects`)."""
+    """Generated cities, with renders: use every clip this often, each time edited to other weather or light, with the city generated in
+    that weather as truth (0 = as it is). For models that take an effect vector (`--network.effects`)."""
     effect_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of the clips in other weather that are trained without their effect vector."""
     textures: str = ""
