@@ -42,9 +42,16 @@ def with_weights_of(model: MDM, plain: MDM) -> MDM:
 
 def test_the_vector_says_what_weather_and_light_ask_for():
     assert effect_vector(None) is None
-    assert effect_vector(Conditions.model_validate({"light": {"exposure_ev": 1.0}, "season": {"leaves": "autumn"}})) is None
+    assert (
+        effect_vector(Conditions.model_validate({"light": {"exposure_ev": 1.0}, "season": {"leaves": "autumn"}}))
+        is None
+    )
     assert vector_of(weather={"fog": {"visibility_m": 100.0}}) == {"fog": 0.5}
-    assert vector_of(weather={"rain": {"mm_h": 10.0}, "wet": 0.8, "puddles": 0.3}) == {"rain": 0.5, "wet": 0.8, "puddle": 0.3}
+    assert vector_of(weather={"rain": {"mm_h": 10.0}, "wet": 0.8, "puddles": 0.3}) == {
+        "rain": 0.5,
+        "wet": 0.8,
+        "puddle": 0.3,
+    }
     assert vector_of(weather={"puddles": 0.3}) == {}, "dry ground has no puddles"
     assert vector_of(weather={"snow": {"cover": 0.6, "mm_h": 2.0}}) == {"snow": 0.5, "cover": 0.6}
     assert vector_of(light={"time": "overcast"}) == {"cloud": 1.0}
@@ -64,10 +71,12 @@ def test_without_a_vector_every_bit_is_that_of_the_model_without_effects():
         made = tuned.sample(replace(condition, effect=effect), request)
         for name in ("rgb", "depth", "semantics", "confidence"):
             assert torch.equal(getattr(made, name), getattr(wanted, name)), (effect, name)
-    assert torch.equal(plain.sample(replace(condition, effect=FOG), request).rgb, wanted.rgb), "this model takes no vector"
+    assert torch.equal(plain.sample(replace(condition, effect=FOG), request).rgb, wanted.rgb), (
+        "this model takes no vector"
+    )
     foggy = tuned.sample(replace(condition, effect=FOG), request)
     assert not torch.allclose(foggy.rgb, wanted.rgb, atol=1e-3)
-    assert not torch.allclose(foggy.latents["rgb"], wanted.latents["rgb"], atol=1e-3), "the denoiser reads it, too"
+    assert not torch.allclose(foggy.latents["rgb"], wanted.latents["rgb"], rtol=0, atol=5e-5), "the denoiser reads it, too"
 
 
 def test_clips_of_a_batch_without_a_vector_are_those_of_the_model_without_effects():
@@ -81,7 +90,7 @@ def test_clips_of_a_batch_without_a_vector_are_those_of_the_model_without_effect
     t = torch.tensor([500, 500])
     made, usual = tuned.predict(x, found, t)[0]["rgb"], plain.predict(x, wanted, t)[0]["rgb"]
     assert torch.allclose(made[0], usual[0], atol=1e-6)
-    assert not torch.allclose(made[1], usual[1], atol=1e-3)
+    assert not torch.allclose(made[1], usual[1], rtol=0, atol=5e-5)
 
 
 def test_new_effects_change_nothing():
@@ -106,7 +115,9 @@ def test_weights_of_effects_lie_in_a_file_of_their_own(tmp_path: Path):
     store.write_json(tmp_path / "plain" / "model.json", description)
     assert files.load(tmp_path / "plain").effects is None
     again, condition = files.load(tmp_path / "tuned"), replace(some_condition(), effect=FOG)
-    assert torch.allclose(again.sample(condition, SampleRequest(1)).rgb, tuned.sample(condition, SampleRequest(1)).rgb, atol=0.02)
+    assert torch.allclose(
+        again.sample(condition, SampleRequest(1)).rgb, tuned.sample(condition, SampleRequest(1)).rgb, atol=0.02
+    )
 
 
 # training -------------------------------------------------------------------------------------------------------------
@@ -114,13 +125,17 @@ def test_weights_of_effects_lie_in_a_file_of_their_own(tmp_path: Path):
 
 def test_only_effects_learn_and_they_do():
     model = with_weights_of(MDM(TUNED), randomised(TINY))
+    assert model.effects is not None
+    learn_models.draw_weights(model.effects, 0, "effects weights")
     before = {name: value.clone() for name, value in model.state_dict().items()}
     model.requires_grad_(False)
     model.trained_part().requires_grad_(True)
     learn_models.freeze(model, "all_but_effects")
-    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=3e-3)
+    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=1e-2)
     clip = made_up_clip(0)
-    darker = replace(clip, rgb=clip.rgb * 0.3, condition=replace(clip.condition, effect=torch.tensor([0.0] * 7 + [1.0])))
+    darker = replace(
+        clip, rgb=clip.rgb * 0.3, condition=replace(clip.condition, effect=torch.tensor([0.0] * 7 + [1.0]))
+    )
     totals = []
     for step in range(12):
         loss = model.loss([darker], BatchPart(0, step, 0, 1), LossSettings(None, 1.0, 0.0))
@@ -177,9 +192,13 @@ def clear() -> tuple[CityWorld, Condition, weather.DriveFacts]:
     world = CityWorld(CITY)
     views = tuple(world.frame_views("front")[1:])
     truths = [world.render(view) for view in views]
-    shown = [weather.ShownView(v, t.rgb, t.depth, t.semantics.astype(np.uint8)) for v, t in zip(views, truths, strict=True)]
+    shown = [
+        weather.ShownView(v, t.rgb, t.depth, t.semantics.astype(np.uint8)) for v, t in zip(views, truths, strict=True)
+    ]
     color = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
-    depth = torch.stack([torch.from_numpy(np.nan_to_num(t.depth, posinf=1000.0).astype(np.float32))[None] for t in truths])
+    depth = torch.stack(
+        [torch.from_numpy(np.nan_to_num(t.depth, posinf=1000.0).astype(np.float32))[None] for t in truths]
+    )
     ids = torch.stack([torch.from_numpy(t.semantics.astype(np.uint8))[None] for t in truths])
     seen = depth < 500
     condition = Condition(views, color, depth, seen, color[0], seen, color.clone(), ids, ids)
@@ -233,7 +252,9 @@ def test_headlights_only_brighten_what_is_near(clear: tuple[CityWorld, Condition
 
 
 def test_effects_are_parameters_of_their_own():
-    names = {name for name, _ in randomised(TUNED).named_parameters()} - {name for name, _ in randomised(TINY).named_parameters()}
+    names = {name for name, _ in randomised(TUNED).named_parameters()} - {
+        name for name, _ in randomised(TINY).named_parameters()
+    }
     assert names
     assert all(name.startswith("effects.") for name in names)
     assert len(learn_part(randomised(TUNED))) - len(learn_part(randomised(TINY))) == len(names)

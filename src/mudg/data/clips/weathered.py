@@ -133,7 +133,9 @@ def witnesses(world: CityWorld, render_at: RenderAt, size: tuple[int, int]) -> D
         view = views[int(number)].resized(*size)
         seen = render_at(view)
         depth = torch.where(seen.semantics == SKY, torch.zeros_like(seen.depth), seen.depth)[0].numpy()
-        shown.append(ShownView(view, seen.color.permute(1, 2, 0).numpy(), depth.astype(np.float32), seen.semantics[0].numpy()))
+        shown.append(
+            ShownView(view, seen.color.permute(1, 2, 0).numpy(), depth.astype(np.float32), seen.semantics[0].numpy())
+        )
     return weather.drive_facts(shown, SRGB)
 
 
@@ -149,7 +151,9 @@ def pairs_of(
     for number, condition in enumerate(conditions):
         rng = seeds.numpy_rng(key, number, "weather")
         pair = draw_pair(KINDS[(key + number) % len(KINDS)], rng, world.config)
-        how = InWeather(pair.settings, drive, world.config.seed, lambda time_s: trajectory.velocity(world.ego_path(), time_s))
+        how = InWeather(
+            pair.settings, drive, world.config.seed, lambda time_s: trajectory.velocity(world.ego_path(), time_s)
+        )
         there = CityWorld(replace(world.config, **pair.changes))
         truths = [_completed(there, there.render(view), view, how) for view in condition.views]
         made.append((weathered(condition, how), truths, pair))
@@ -159,7 +163,10 @@ def pairs_of(
 def _completed(world: CityWorld, truth: CityTruth, view: View, how: InWeather) -> CityTruth:
     """The truth with what the city has none of: rain and snow in the air, headlights."""
     asked, light = how.settings.weather, how.settings.light
-    rain, snow = asked.rain, None if asked.snow is None or not asked.snow.mm_h else asked.snow.model_copy(update={"cover": 0.0})
+    rain, snow = (
+        asked.rain,
+        None if asked.snow is None or not asked.snow.mm_h else asked.snow.model_copy(update={"cover": 0.0}),
+    )
     headlights = light.time == "night" and light.headlights
     if rain is None and snow is None and not headlights:
         return truth

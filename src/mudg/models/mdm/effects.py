@@ -71,10 +71,15 @@ class Effects(nn.Module):
         rank: channels of the layers.
     """
 
-    def __init__(self, embed: int, net: Sequence[tuple[int, int]], refine: Sequence[tuple[int, int]], rank: int) -> None:
+    def __init__(
+        self, embed: int, net: Sequence[tuple[int, int]], refine: Sequence[tuple[int, int]], rank: int
+    ) -> None:
         super().__init__()
         self.read = nn.Sequential(
-            nn.Linear(len(EFFECTS), FEATURES, bias=False), nn.SiLU(), nn.Linear(FEATURES, FEATURES, bias=False), nn.SiLU()
+            nn.Linear(len(EFFECTS), FEATURES, bias=False),
+            nn.SiLU(),
+            nn.Linear(FEATURES, FEATURES, bias=False),
+            nn.SiLU(),
         )
         self.time = nn.Linear(FEATURES, embed, bias=False)
         self.net = nn.ModuleList(EffectLayer(*sides, rank) for sides in net)

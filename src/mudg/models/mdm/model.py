@@ -23,9 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette, seeds
-from mudg.base.effects import EFFECTS
 from mudg.base.errors import UsageError
-from mudg.base.renders import RenderPlanes
 from mudg.base.types import Clip, Condition
 from mudg.core import losses, noise
 from mudg.core.align import align_depth
@@ -62,8 +60,8 @@ from mudg.models.mdm.network import (
     Refiner,
     TemporalAttention,
     UNet,
-    shares,
 )  # fmt: skip
+from mudg.models.mdm.stacked import Stacked, cell_means, cell_shares
 
 SKY = palette.ID["sky"]
 
@@ -157,9 +155,6 @@ sum."""
 RENDER_GATES = 2
 """Their further outputs: how much of the render's colour and of its depth is copied."""
 
-NO_RENDER = -1.0
-"""Coverage that stands for: there is no render."""
-
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
 
@@ -215,15 +210,15 @@ class MDM(nn.Module):
         A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
         unknown classes.
         """
-        given = _Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
+        given = Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
         color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
         self.check_size(*color.shape[-2:])
         factor = self.codec.factor
         copy: dict[Modality, Tensor] = {
-            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": _cell_shares(ids),
+            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": cell_shares(ids),
         }  # fmt: skip
         seen: dict[Modality, Tensor] = {
-            "rgb": _cell_means(torch.maximum(valid, warped), factor), "depth": _cell_means(valid, factor),
+            "rgb": cell_means(torch.maximum(valid, warped), factor), "depth": cell_means(valid, factor),
             "semantics": copy["semantics"].sum(2, keepdim=True),
         }  # fmt: skip
         far = self.codec.encode_rgb(given.backdrop)
@@ -234,12 +229,12 @@ class MDM(nn.Module):
             return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, effect=effect)
         shown = given.renders
         render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
-        classes, certainty = _cell_shares(shown.semantics), _cell_means(shown.certainty, factor)
-        alpha = _cell_means(shown.alpha, factor)
+        classes, certainty = cell_shares(shown.semantics), cell_means(shown.certainty, factor)
+        alpha = cell_means(shown.alpha, factor)
         planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
         return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty, effect)
 
-    def _pixels_of(self, given: _Stacked) -> ConditionPixels:
+    def _pixels_of(self, given: Stacked) -> ConditionPixels:
         """What the refiner sees of a batch of conditions, [B*T,..]."""
         code = self.codec.linear_depth_code
         pixels = [
@@ -385,7 +380,7 @@ class MDM(nn.Module):
                 clip = Made(*(getattr(small, f.name)[own] for f in fields(small)))
                 enlarged.append(clip.enlarged(size, (top, top + height), (left, left + width)))
             made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
-            given = self._pixels_of(_Stacked.of([patch.clip.condition for _, patch in patches]))
+            given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
             truth = self.pixel_truth([patch.clip for _, patch in patches])
             scale = torch.tensor([float(patch.scale) for _, patch in patches], device=made.rgb.device).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
@@ -511,7 +506,7 @@ class MDM(nn.Module):
         """
         if self.finisher is None or clip.log_error is None:
             raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
-        given = self._pixels_of(_Stacked.of([fine]))
+        given = self._pixels_of(Stacked.of([fine]))
         code = self.codec.linear_depth_code(clip.depth)
         made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
@@ -553,7 +548,7 @@ class MDM(nn.Module):
     def _encode_start(self, start: StartClip, device: torch.device) -> tuple[Tensor, Tensor]:
         """Latents [1,T,C,h,w] of the clip that a sample begins from, and the freedom f32[1,T,1,h,w] of their cells."""
         rgb, depth, ids = (x[None].to(device) for x in (start.rgb, start.depth, start.semantics))
-        shares = self.codec.shares_to_latent(_cell_shares(ids))
+        shares = self.codec.shares_to_latent(cell_shares(ids))
         latents = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
         freedom = functional.max_pool2d(start.freedom.to(device), self.codec.factor)[None]
         return latents, freedom
@@ -562,59 +557,3 @@ class MDM(nn.Module):
 def _expected_error(log_error: Tensor) -> Tensor:
     """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
     return log_error.clamp(-6, 1).exp() / 2
-
-
-@dataclass(frozen=True)
-class _Stacked:
-    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour as backdrop,
-    unknown classes, no render. Masks are f32."""
-
-    color: Tensor
-    depth: Tensor
-    valid: Tensor
-    warped: Tensor
-    backdrop: Tensor
-    ids: Tensor
-    backdrop_ids: Tensor
-    renders: RenderPlanes
-    effect: Tensor | None
-
-    @classmethod
-    def of(cls, batch: Sequence[Condition]) -> _Stacked:
-        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
-        renders = [_no_render(c) if c.renders is None else c.renders for c in batch]
-        return cls(
-            *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
-            torch.stack([c.valid for c in batch]).float(),
-            torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch]).float(),
-            torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch]),
-            torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
-            torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
-            RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
-            _effects_of(batch),
-        )
-
-
-def _effects_of(batch: Sequence[Condition]) -> Tensor | None:
-    """Effect vectors [B,8], zeros for a clip without one; None where none has any, or only zeros."""
-    if all(c.effect is None or not bool(c.effect.any()) for c in batch):
-        return None
-    nothing = torch.zeros(len(EFFECTS), device=batch[0].color.device)
-    return torch.stack([nothing if c.effect is None else c.effect for c in batch])
-
-
-def _cell_means(mask: Tensor, factor: int) -> Tensor:
-    """Mean over the pixels of each cell, f32[B,T,1,H,W] -> f32[B,T,1,h,w]."""
-    return functional.avg_pool2d(mask.flatten(0, 1), factor).unflatten(0, mask.shape[:2])
-
-
-def _cell_shares(ids: Tensor) -> Tensor:
-    """Share of each class in each cell, u8[B,T,1,H,W] -> f32[B,T,19,h,w]."""
-    return shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
-
-
-def _no_render(condition: Condition) -> RenderPlanes:
-    """The planes that stand for: there is no render."""
-    nothing = torch.zeros_like(condition.depth)
-    unknown = torch.full_like(condition.valid, palette.UNLABELLED, dtype=torch.uint8)
-    return RenderPlanes(condition.color, condition.depth, nothing + NO_RENDER, nothing, unknown)

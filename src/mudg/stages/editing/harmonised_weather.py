@@ -50,7 +50,12 @@ class WeatherHarmoniser:
     """Corrects views in other weather, window after window along a path."""
 
     def __init__(
-        self, sources: EditedSources, how: InWeather, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto"
+        self,
+        sources: EditedSources,
+        how: InWeather,
+        config: HarmonizeConfig,
+        size: tuple[int, int],
+        device: str = "auto",
     ) -> None:
         """``size``: width and height of the views."""
         settings = SynthesizeConfig(
@@ -75,7 +80,9 @@ class WeatherHarmoniser:
         window = self._model.config.window
         for number, span in enumerate(windows(len(views), window, min(OVERLAP, window - 1))):
             renders = {i: renders[i] if i in renders else draw(views[i])[1] for i in span}
-            condition = weathered(conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0], self._how)
+            condition = weathered(
+                conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0], self._how
+            )
             shown = list(renders.values())
             freedom = [torch.full_like(render.rgb[0], self._freedom) for render in shown]
             start = start_clip(shown, freedom, condition.color.shape[-2:])
@@ -90,5 +97,7 @@ class WeatherHarmoniser:
 def corrected(render: Observation, made: Tensor) -> Observation:
     """A render with what `made` f32[3,h,w], of any size, changes of it at that size."""
     area = functional.interpolate(render.rgb[None], size=made.shape[-2:], mode="area")
-    change = functional.interpolate(made[None] - area, size=render.rgb.shape[-2:], mode="bilinear", align_corners=False)[0]
+    change = functional.interpolate(
+        made[None] - area, size=render.rgb.shape[-2:], mode="bilinear", align_corners=False
+    )[0]
     return replace(render, rgb=(render.rgb + change).clamp(0, 1))
