@@ -24,6 +24,8 @@ from mudg.data.clips.weathered import InWeather
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings
+from mudg.stages.config import LearnConfig
+from mudg.stages.config.learn import LearnData
 from mudg.stages.learning import models as learn_models
 
 TUNED = replace(TINY, effects=4)
@@ -149,9 +151,25 @@ def test_only_effects_learn_and_they_do():
     assert all(name.startswith("effects.") for name in changed)
 
 
-def test_a_model_without_effects_has_nothing_left_to_train():
+def test_effects_and_clips_in_other_weather_go_together():
     with pytest.raises(UsageError, match="nothing is left"):
         learn_models.freeze(randomised(TINY), "all_but_effects")
+    check, weathers = learn_models.check_effects, LearnConfig(data=LearnData(weathers=2))
+    check(randomised(TUNED), {"effects"}, weathers)
+    check(randomised(TUNED), set(), LearnConfig())
+    check(randomised(TINY), {"effects"}, LearnConfig())
+    for model, fresh, config, said in (
+        (TINY, set[str](), weathers, "takes an effect vector"),
+        (TUNED, {"effects"}, LearnConfig(), "learned from clips in other weather"),
+        (TUNED, set[str](), LearnConfig(frozen="all_but_effects"), "learned from clips in other weather"),
+        (TUNED, set[str](), replace(weathers, data=LearnData(weathers=2, renders=False)), "with renders"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            check(randomised(model), fresh, config)
+    model = randomised(TUNED)
+    learn_models.hold_effects(model, 0)
+    assert model.effects is not None
+    assert not any(value.requires_grad for value in model.effects.parameters())
 
 
 def test_a_share_of_the_clips_goes_without_its_vector_wherever_the_batch_is_divided():

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from mudg.base import checks, geometry
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
-from mudg.base.effects import EFFECTS
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 
@@ -436,7 +435,7 @@ class Condition:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
         one = (t, 1, h, w)
         checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
-        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one, effect=(len(EFFECTS),))
+        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one, effect=(8,))
         if self.renders is not None:
             checks.check_tensors(self.renders, color=(t, 3, h, w))
 

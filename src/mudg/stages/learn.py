@@ -41,7 +41,16 @@ from mudg.stages.learning import codec as learn_codec
 from mudg.stages.learning import parallel
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.clips import class_weights, draw_clips
-from mudg.stages.learning.models import Model, draw_weights, freeze, hold_finisher, kind_of, starting_model
+from mudg.stages.learning.models import (
+    Model,
+    check_effects,
+    draw_weights,
+    freeze,
+    hold_effects,
+    hold_finisher,
+    kind_of,
+    starting_model,
+)  # fmt: skip
 from mudg.stages.learning.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.state import TrainingState, mean_of
@@ -69,6 +78,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
+        check_effects(model, fresh, config)
         directory = _open(config, out, overwrite, ranks)
         if directory is None:
             return out / "model"
@@ -155,6 +165,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
+        hold_effects(model, config.data.weathers)
         hold_finisher(model, fresh, learn_clips.have_patches(folder, config.data.skip_cities))
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 

@@ -138,6 +138,26 @@ def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
     log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
 
 
+def check_effects(model: Model, fresh: set[str], config: LearnConfig) -> None:
+    """UsageError unless effects and clips in other weather go together: what learns from such clips takes an effect vector, and what is
+    new, or alone trained, has such clips to learn from."""
+    effects, weathers = model.effects if isinstance(model, MDM) else None, config.data.weathers
+    if weathers and effects is None:
+        raise UsageError("clips in other weather need a model that takes an effect vector", where="--data.weathers", got=str(weathers),
+                         remedy="give --network.effects 16, or leave it out")  # fmt: skip
+    if weathers and (config.data.scenes or not config.data.renders or config.compute.parallel == "fsdp"):
+        raise UsageError("clips in other weather are made of generated cities with renders, and learned in one process or with ddp",
+                         where="--data.weathers", got=str(weathers), remedy="leave it out")  # fmt: skip
+    if effects is not None and not weathers and ("effects" in fresh or config.frozen == "all_but_effects"):
+        raise UsageError("effects are learned from clips in other weather", where="--data.weathers", got="0", expected="1 or more")
+
+
+def hold_effects(model: Model, weathers: int) -> None:
+    """Let the effects keep their weights if no clip is in other weather."""
+    if isinstance(model, MDM) and model.effects is not None and not weathers:
+        model.effects.requires_grad_(False)
+
+
 def _network_is_default(config: LearnConfig) -> bool:
     """Whether the settings leave the network as it is by default."""
     default = LearnConfig(data=config.data)
