@@ -18,6 +18,8 @@ from mudg.models.mdm.codec import ChannelNorm
 
 FEATURES = 64
 """Features that the vector becomes."""
+GAIN = 8.0
+"""Factor of the features: without it those of fresh weights are small, and the gates hardly open."""
 
 
 class EffectLayer(nn.Module):
@@ -95,4 +97,4 @@ class Effects(nn.Module):
 
     def features(self, vector: Tensor) -> Tensor:
         """[B,8] -> [B,FEATURES]; zeros for zeros."""
-        return self.read(vector)
+        return GAIN * self.read(vector)
