@@ -336,6 +336,7 @@ def test_weather_is_corrected_by_a_model_that_takes_an_effect_vector(run: Path, 
         assert torch.equal(new.semantics, before.semantics)
 
 
+@pytest.mark.slow
 def test_views_are_generated_in_weather_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
     edits, folders = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse")
     config = SynthesizeConfig(shifts_m=(0.0,), model=with_effects(run), steps=1, full_size=False, processes=1, precision="float32")

@@ -95,9 +95,12 @@ class WeatherHarmoniser:
 
 
 def corrected(render: Observation, made: Tensor) -> Observation:
-    """A render with what `made` f32[3,h,w], of any size, changes of it at that size."""
-    area = functional.interpolate(render.rgb[None], size=made.shape[-2:], mode="area")
-    change = functional.interpolate(
-        made[None] - area, size=render.rgb.shape[-2:], mode="bilinear", align_corners=False
-    )[0]
-    return replace(render, rgb=(render.rgb + change).clamp(0, 1))
+    """A render with what `made` f32[3,h,w], of any size, changes of it (see `changed_by`)."""
+    return replace(render, rgb=changed_by(render.rgb, made))
+
+
+def changed_by(rgb: Tensor, made: Tensor) -> Tensor:
+    """Colours f32[3,H,W] with what `made` f32[3,h,w], of any size, changes of them at that size."""
+    area = functional.interpolate(rgb[None], size=made.shape[-2:], mode="area")
+    change = functional.interpolate(made[None] - area, size=rgb.shape[-2:], mode="bilinear", align_corners=False)[0]
+    return (rgb + change).clamp(0, 1)
