@@ -166,9 +166,10 @@ def _report(args: f.ReportFlags) -> dict[str, Any]:
 
 
 def _view(args: f.ViewFlags) -> dict[str, Any]:
-    from mudg.stages.viewing import view
+    from mudg.stages.viewing import edits, view
 
-    return view.run_view(args.settings, args.run, args.compare, scene=args.scene)
+    files = edits.EditFiles(args.edits, args.edits_out, args.overwrite)
+    return view.run_view(args.settings, args.run, args.compare, scene=args.scene, files=files)
 
 
 def _score(args: f.Score) -> dict[str, Any]:

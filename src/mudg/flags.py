@@ -278,6 +278,12 @@ class ViewFlags(Common):
     """A second run or fit of the same log, to compare with. The same run: its two fits."""
     scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
+    """Edit script (docs/edit.md) that the page begins with."""
+    edits_out: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
+    """Where edits made on the page are saved (without it: edits.yaml beside RUN, or in the current folder)."""
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Save edits over a file that mudg view did not write."""
     settings: Annotated[stage_config.ViewConfig, arg(name="")]
 
 

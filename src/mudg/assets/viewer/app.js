@@ -44,6 +44,7 @@ export class App {
       return { t, points };
     });
     this.tracks = tracks;
+    this.ground = log.ground ?? null; // levels of heights
     for (const [k, scene] of facts.scenes.entries()) {
       const bytes = await bytesOf(`scene-${k}`, scene.url, (share) => progress((k + 0.8 * share) / facts.scenes.length));
       const found = new SplatScene(scene, sectionsOf(await inflate(bytes), scene.directory));
@@ -143,7 +144,7 @@ export class App {
 
   /** Keeps the order of a scene up to date; draws again when a better one is there. */
   ensureOrder(loaded, view) {
-    const key = [this.state.t, ...view.eye, ...view.axes[2], [...this.state.hidden].join()].join();
+    const key = [this.state.t, ...view.eye, ...view.axes[2], [...this.state.hidden].join(), this.state.edition].join();
     if (loaded.key === key) return;
     loaded.key = key;
     this.renderer.sort(loaded, view, this.state.t, this.state.hidden, (there) => { if (there) this.again(); });

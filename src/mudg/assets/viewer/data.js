@@ -110,7 +110,7 @@ export class SplatScene {
     this.nodes.forEach((node, i) => {
       const at = 24 * i;
       const pose = node.pose ? node.pose.at(t) : { position: [0, 0, 0], rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1] };
-      const shown = pose !== null && !hidden.has(node.name);
+      const shown = pose !== null && !node.removed && !hidden.has(node.name);
       rows[at + 13] = -1;
       if (!shown) return;
       const r = pose.rotation;

@@ -1,5 +1,7 @@
 // Behind `mudg view` stands a server that draws with the program's own rasterizer. When the camera rests, its frame replaces the page's.
 
+import { scriptText } from "mudg/edits";
+
 /** Asks for exact frames whenever the camera rests. */
 export function exactFrames(app) {
   const { live } = app.facts, badge = document.getElementById("exact");
@@ -7,11 +9,11 @@ export function exactFrames(app) {
   let current = null;
   app.onRest = async () => {
     const s = app.state;
-    if (!live.layers.includes(s.layer)) return;
+    if (!live.layers.includes(s.layer) || app.editor.wrong) return;
     current?.abort();
     current = new AbortController();
     const view = app.last.view, asked = app.changed;
-    const body = { scene: s.scene, layer: s.layer, time_s: s.t + app.facts.begin_s, hidden: [...s.hidden], camera: s.mode === "recorded" ? s.camera : "",
+    const body = { scene: s.scene, layer: s.layer, time_s: s.t + app.facts.begin_s, hidden: [...s.hidden], edits: scriptText(s.edits), camera: s.mode === "recorded" ? s.camera : "",
       width: view.width, height: view.height, fx: view.fx, fy: view.fy, cx: view.cx, cy: view.cy, eye: view.eye, axes: view.axes };
     try {
       const answer = await fetch("frame", { method: "POST", headers: { "Content-Type": "application/json", "X-Mudg-Token": live.token }, body: JSON.stringify(body), signal: current.signal });

@@ -1,6 +1,7 @@
 // Mouse, touch and keyboard on the picture.
 
 import { clamp } from "mudg/math";
+import { objectAt } from "mudg/gizmo";
 import { LAYERS } from "mudg/shaders";
 
 const SPEED_M_S = 6;
@@ -14,14 +15,16 @@ export function listen(app, controls) {
 
 function pointers(app) {
   const { stage } = app, fingers = new Map();
-  let spread = 0, moved = 0;
+  let spread = 0, moved = 0, holder = null;
   stage.addEventListener("pointerdown", (event) => {
     if (event.target.id === "divider") return;
     stage.setPointerCapture(event.pointerId);
+    if (!fingers.size && app.gizmo.take(...placeOf(app, event))) { holder = event.pointerId; return; }
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     moved = 0;
   });
   stage.addEventListener("pointermove", (event) => {
+    if (event.pointerId === holder) { app.gizmo.drag(...placeOf(app, event)); return; }
     const before = fingers.get(event.pointerId);
     if (!before) { hover(app, event); return; }
     const dx = event.clientX - before[0], dy = event.clientY - before[1];
@@ -36,6 +39,7 @@ function pointers(app) {
     app.change();
   });
   const up = (event) => {
+    if (event.pointerId === holder) { holder = null; app.gizmo.release(); return; }
     if (fingers.delete(event.pointerId) && moved < 4 && event.type === "pointerup") click(app, event);
     spread = 0;
   };
@@ -48,11 +52,15 @@ function pointers(app) {
   }, { passive: false });
 }
 
+/** Place of a pointer on the picture, in its pixels. */
+function placeOf(app, event) {
+  const box = app.stage.getBoundingClientRect(), [x0, y0] = app.last.area, ratio = app.last.ratio ?? 1;
+  return [(event.clientX - box.left) * ratio - x0, (event.clientY - box.top) * ratio - y0];
+}
+
 /** The recorded camera under a pointer, if cameras are shown. */
 function frameUnder(app, event) {
-  if (!app.state.cameras) return null;
-  const box = app.stage.getBoundingClientRect(), [x0, y0] = app.last.area, ratio = app.last.ratio ?? 1;
-  return app.overlayDrawer.frameAt((event.clientX - box.left) * ratio - x0, (event.clientY - box.top) * ratio - y0);
+  return app.state.cameras ? app.overlayDrawer.frameAt(...placeOf(app, event)) : null;
 }
 
 /** A pointer over a recorded camera shows its image. */
@@ -65,15 +73,35 @@ function hover(app, event) {
   Object.assign(thumb.style, { left: `${clamp(event.clientX - box.left, 92, box.width - 92)}px`, top: `${Math.max(140, event.clientY - box.top)}px` });
 }
 
-/** A click on a recorded camera jumps there. */
+/** A click on a recorded camera jumps there; on an object, selects it. */
 function click(app, event) {
-  const frame = frameUnder(app, event);
-  if (frame) app.change({ mode: "recorded", camera: frame.camera, t: frame.t, shift: 0, up: 0 });
+  const frame = frameUnder(app, event), { view } = app.last;
+  if (!frame) app.change({ selected: view ? objectAt(view, ...placeOf(app, event), app.tracks, app.state.t) : null });
+  else app.change({ mode: "recorded", camera: frame.camera, t: frame.t, shift: 0, up: 0 });
+}
+
+const NUDGES = { ArrowUp: { along_m: 0.1 }, ArrowDown: { along_m: -0.1 }, ArrowLeft: { left_m: 0.1 }, ArrowRight: { left_m: -0.1 }, "<": { yaw_deg: 1 }, ">": { yaw_deg: -1 } };
+
+/** Keys of the editor; whether the key was one. */
+function edited(app, event) {
+  if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName) && event.target.type !== "range" || document.querySelector("dialog[open]")) return false;
+  const { editor, state } = app, id = state.selected, letter = event.key.toLowerCase();
+  if ((event.ctrlKey || event.metaKey) && !event.altKey && (letter === "z" || letter === "y")) {
+    if (letter === "y" || event.shiftKey) editor.redo(); else editor.undo();
+    return true;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey || id === null) return false;
+  if (event.shiftKey && NUDGES[event.key]) editor.move(id, NUDGES[event.key]);
+  else if (event.key === "Delete" || event.key === "Backspace") editor.remove(id);
+  else if (event.key === "Escape") app.change({ selected: null });
+  else return false;
+  return true;
 }
 
 function keyboard(app, controls) {
   const held = new Set();
   addEventListener("keydown", (event) => {
+    if (edited(app, event)) { event.preventDefault(); return; }
     if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName) && event.target.type !== "range") return;
     if (document.querySelector("dialog[open]")) return;
     const s = app.state, number = Number(event.key);

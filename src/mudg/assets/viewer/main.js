@@ -1,7 +1,9 @@
 // Starts the page: reads its facts, unpacks, shows the controls; says what is wrong where it cannot.
 
 import { App } from "mudg/app";
+import { Editor } from "mudg/editor";
 import { exactFrames } from "mudg/exact";
+import { Gizmo } from "mudg/gizmo";
 import { listen } from "mudg/input";
 import { Controls } from "mudg/ui";
 
@@ -11,6 +13,8 @@ async function start() {
   const facts = JSON.parse($("facts").textContent);
   const app = new App(facts, { canvas: $("canvas"), overlay: $("overlay"), stage: $("stage") });
   await app.load((share) => { $("progress").value = share; });
+  app.editor = new Editor(app);
+  app.gizmo = app.overlayDrawer.gizmo = new Gizmo(app, app.editor);
   exactFrames(app);
   listen(app, new Controls(app));
   $("loading").hidden = true;

@@ -40,11 +40,13 @@ export class Overlay {
     if (state.lidar) this.points(view, state.t);
     if (state.cameras) this.frustums(view, state);
     for (const track of this.tracks) {
+      if (track.removed) continue;
       const chosen = state.selected === track.id;
       if (state.paths || chosen) this.path(view, track, state.t);
       if (state.boxes || chosen) this.box(view, track, state.t, chosen);
     }
     if (state.paths) this.line(view, this.drive.ego.positions, "rgb(255 255 255 / .8)", 2);
+    if (state.selected) this.gizmo?.draw(c, view, ratio);
     c.restore();
   }
 

@@ -1,6 +1,7 @@
 // What leaves the page: pictures, videos, links.
 
 import { scaled } from "mudg/app";
+import { scriptText } from "mudg/edits";
 import { toHash } from "mudg/state";
 
 const MOST_SIDE = 8192;
@@ -47,15 +48,16 @@ export function recordVideo(app, say) {
   say("Recording. Pause to end it.");
 }
 
-/** What is hidden on the page as an edit script for `mudg edit` and `mudg render --edits`; empty where nothing is. */
+/** What was edited and what is hidden as an edit script for `mudg edit` and `mudg render --edits`; empty where nothing is. */
 export function editScript(state) {
-  return state.hidden.size ? `- remove: {ids: ${JSON.stringify([...state.hidden].sort())}}\n` : "";
+  return scriptText(state.edits ?? [], state.hidden);
 }
 
-/** Saves the edit script. */
-export function saveEdits(app) {
+/** Saves the edit script: where `mudg view` was told to, or as a download. */
+export async function saveEdits(app) {
   const text = editScript(app.state);
-  if (!text) return "Nothing is hidden: hide objects first.";
+  if (!text) return "There are no edits to save.";
+  if (app.facts.live) return app.editor.saveThere();
   save(new Blob([text], { type: "application/yaml" }), "edits.yaml");
   return "Saved edits.yaml for mudg edit.";
 }

@@ -8,7 +8,7 @@ import { clamp } from "mudg/math";
 export function initialState(facts) {
   return {
     mode: "recorded", camera: Object.keys(facts.cameras)[0], t: 0, shift: 0, up: 0, layer: "color", playing: false, speed: 1, loop: true,
-    compare: "none", divider: 0.5, scene: 0, boxes: false, paths: false, lidar: false, cameras: false, hidden: new Set(), selected: null,
+    compare: "none", divider: 0.5, scene: 0, boxes: false, paths: false, lidar: false, cameras: false, hidden: new Set(), selected: null, edits: [], edition: 0,
     eye: [0, 0, 2], yaw: 0, pitch: 0, target: [0, 0, 0], distance: 12, behind: 12, height: 45, turn: 0, tilt: 0,
   };
 }

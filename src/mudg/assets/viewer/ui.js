@@ -141,7 +141,7 @@ export class Controls {
     $("filter").oninput = ({ target }) => {
       for (const item of list.children) item.hidden = !item.dataset.name.includes(target.value.toLowerCase());
     };
-    $("edits").onclick = () => this.say(saveEdits(app));
+    $("edits").onclick = async () => this.say(await saveEdits(app));
     $("all").onclick = () => { app.state.hidden.clear(); app.change(); };
   }
 
@@ -193,7 +193,7 @@ export class Controls {
   /** Brings all controls in line with the state. */
   show() {
     const { app } = this, s = app.state;
-    $("edits").disabled = !s.hidden.size;
+    $("edits").disabled = !s.hidden.size && !s.edits.length;
     $("mode").value = s.mode;
     $("camera").value = s.camera;
     $("compare").value = s.compare;

@@ -1,14 +1,14 @@
 """What the viewer page knows about a log besides Gaussians: cameras, frames with small images, boxes, the vehicle's path, LiDAR points.
 
 Times on the page are seconds since the first frame. Sections of the log's blob (see ``packed.py``): ``keys`` f32[k, 8] and ``lidar``
-u16[m, 3], places in the world as ``lidar_low + value * lidar_step``.
+u16[m, 3], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see ``with_ground``).
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from PIL import Image
 from mudg.base import palette
 from mudg.base.camera_colors import CameraColors
 from mudg.base.types import Camera, Frame, Scene
+from mudg.core.ground import HeightMap
 from mudg.core.pictures import depth_colors, resize_area
 from mudg.data.scene import read_image, read_points
 from mudg.report.page import FAR_M, NEAR_M
@@ -25,6 +26,9 @@ from mudg.report.viewer.packed import Sections, key_rows
 
 WEBP_QUALITY: Final = 50
 REACH_M: Final = 80.0
+MOST_CELLS: Final = 4_000_000
+UNKNOWN: Final = 65535
+"""Level of the ground where its height is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +80,20 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
         "depth_colors": depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist(),
     }  # fmt: skip
     return PageFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
+
+
+def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
+    """The page with heights of the ground, for objects that are moved on it; without them where they are not known or too many.
+
+    Section ``ground``: world z as ``low + value * step``, less than 1 mm apart within 65 m; `UNKNOWN` where it is not known.
+    """
+    if ground is None or ground.heights.size > MOST_CELLS or not np.isfinite(ground.heights).any() or min(ground.heights.shape) < 2:
+        return replace(page, facts=page.facts | {"ground": None})
+    low, high = float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights))
+    step = max((high - low) / (UNKNOWN - 1), 1e-6)
+    levels = np.where(np.isfinite(ground.heights), np.rint((ground.heights - low) / step), UNKNOWN).astype(np.uint16)
+    record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape), "low": low, "step": step}
+    return replace(page, facts=page.facts | {"ground": record}, sections=page.sections | {"ground": levels})
 
 
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from mudg.report.viewer.packed import Packed, blob_of
 ONE_FILE_BYTES: Final = 32 * 2**20
 """A page larger than this becomes a folder: not every browser opens larger ones."""
 MODULES: Final = (
-    "math", "data", "sorter", "shaders", "renderer", "cameras", "state", "overlay", "app", "share", "ui", "input", "exact", "main",
+    "math", "data", "sorter", "shaders", "renderer", "cameras", "state", "overlay", "edits", "app", "share", "gizmo", "editor",
+    "ui", "input", "exact", "main",
 )  # fmt: skip
 
 

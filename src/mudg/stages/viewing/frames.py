@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -25,12 +25,14 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class FrameRequest(StrictRecord):
-    """One frame, as ``assets/viewer/exact.js`` asks for it. ``axes``: the camera's right, down and ahead in the world."""
+    """One frame, as ``assets/viewer/exact.js`` asks for it. ``axes``: the camera's right, down and ahead in the world. ``edits``: a
+    script."""
 
     scene: Annotated[int, Field(ge=0)]
     layer: Literal["color", "depth", "class"]
     time_s: Number
     hidden: Annotated[list[str], Field(max_length=100_000)]
+    edits: Annotated[str, Field(max_length=1_000_000)] = ""
     camera: str
     width: Annotated[int, Field(ge=1, le=8192)]
     height: Annotated[int, Field(ge=1, le=8192)]
@@ -43,10 +45,16 @@ class FrameRequest(StrictRecord):
 
 
 class FrameSource:
-    """Draws frames of one or two fitted scenes, one at a time."""
+    """Draws frames of one or two fitted scenes, one at a time.
 
-    def __init__(self, models: Sequence[SceneModel], widest: int, device: torch.device) -> None:
-        self._models = [model.to(device) for model in models]
+    Args:
+        edited: the scenes with a script carried out; "" = as they are.
+    """
+
+    def __init__(self, edited: Callable[[str], Sequence[SceneModel]], widest: int, device: torch.device) -> None:
+        self._edited = edited
+        self._device = device
+        self._shown: tuple[str, list[SceneModel]] | None = None
         self._widest = widest
         self._lock = threading.Lock()
 
@@ -54,11 +62,14 @@ class FrameSource:
         """A frame as PNG bytes.
 
         Raises:
-            InputError: no such scene of the page, or a camera that is none.
+            InputError: a camera that is none, or edits that cannot be carried out.
         """
-        model = self._models[min(asked.scene, len(self._models) - 1)]
-        gone = [name for name in asked.hidden if name in model.node_names()]
         with self._lock, torch.no_grad():
+            if self._shown is None or self._shown[0] != asked.edits:
+                self._shown = asked.edits, [model.to(self._device) for model in self._edited(asked.edits)]
+            models = self._shown[1]
+            model = models[min(asked.scene, len(models) - 1)]
+            gone = [name for name in asked.hidden if name in model.node_names()]
             shown = model.without_nodes(gone) if gone else model
             seen = render_view(shown, self._view(asked), raster_of(model))
         content = io.BytesIO()

@@ -20,6 +20,8 @@ from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 MOST_BYTES: Final = 8 * 2**20
 """Of a request's body."""
 COOKIE: Final = "mudg_token"
+Answer = Callable[[Any], tuple[bytes, str]]
+"""From a JSON value to content and its type."""
 TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-stream"}
 
 
@@ -33,7 +35,7 @@ class Site:
     """
 
     files: Mapping[str, bytes]
-    answers: Mapping[str, Callable[[Any], tuple[bytes, str]]]
+    answers: Mapping[str, Answer]
     token: str
 
 

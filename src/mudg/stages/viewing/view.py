@@ -15,28 +15,40 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.records import parse_record
 from mudg.base.run_folder import refuse_overlap
-from mudg.base.types import Scene
+from mudg.base.types import FusedCloud, Scene
+from mudg.core.ground import HeightMap
 from mudg.core.raster.place import drawing_device
+from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
-from mudg.report.viewer.facts import begin_of, log_facts
+from mudg.report.viewer.facts import begin_of, log_facts, with_ground
 from mudg.report.viewer.packed import Packed, pack_scene
 from mudg.report.viewer.page import ONE_FILE_BYTES, ViewerPage
 from mudg.stages.config.view import PageConfig, ViewConfig
+from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.fitting.storage import load_model, model_of_scene
+from mudg.stages.viewing.edits import EditFiles, EditRequest, desk_for
 from mudg.stages.viewing.frames import LAYERS, FrameRequest, FrameSource
-from mudg.stages.viewing.server import Site, address_of, open_server, show, token_for
+from mudg.stages.viewing.server import Answer, Site, address_of, open_server, show, token_for
 
 NAMES: Final = {"mudg_s": "with diffusion", "street_gaussians": "without diffusion"}
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What a page shows: the log, and one or two fits to it by name."""
+    """What a page shows: the log, one or two fits to it by name, and its fused points, where they are known."""
 
     scene: Scene
     fits: tuple[tuple[str, SceneModel], ...]
+    cloud: FusedCloud | None = None
+
+    def ground(self) -> HeightMap | None:
+        """What edited objects stand on; None where it is not known."""
+        try:
+            return ground_of(self.cloud, self.fits[0][1])
+        except InputError:  # it spans too large an area
+            return None
 
 
 def run_page(
@@ -116,7 +128,7 @@ def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path 
             else next((n for n in others.fits if n != fits[0][0]), "")
         )
         fits.append(_fit_of(others, same, loaded))
-    return Shown(loaded, tuple(fits))
+    return Shown(loaded, tuple(fits), None if parts.fused is None else read_fused(parts.fused))
 
 
 def _fit_of(parts: RunParts, method: str, scene: Scene) -> tuple[str, SceneModel]:
@@ -140,6 +152,7 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     path = np.stack([frame.view.center_world for frame in scene.frames])
     packed = [(name, pack_scene(model, begin, path, config.budget)) for name, model in shown.fits]
     facts = log_facts(scene, shown.fits[0][1].colors, config.image_width_px, config.images, config.lidar_points)
+    facts = with_ground(facts, shown.ground())
     first = packed[0][1]
     return ViewerPage(
         title=scene.id, subtitle=", ".join(f"{name} ({NAMES[name]})" if name in NAMES else name for name, _ in packed),
@@ -167,14 +180,22 @@ def budget_text(page: ViewerPage, data: dict[str, bytes], out: Path) -> str:
 
 
 def run_view(
-    config: ViewConfig, run: Path, compare: Path | None = None, *, scene: Path | None = None
+    config: ViewConfig,
+    run: Path,
+    compare: Path | None = None,
+    *,
+    scene: Path | None = None,
+    files: EditFiles | None = None,
 ) -> dict[str, Any]:
     """Serve the page of a run until it is interrupted.
+
+    Args:
+        files: the script that it begins with, and where edits are saved.
 
     Raises:
         UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As ``run_page``.
     """
-    server, site = server_of(config, run, compare, scene)
+    server, site = server_of(config, run, compare, scene, files)
     address = address_of(server, site)
     log.info(f"viewer: {address}   (Ctrl-C ends it)")
     show(address, server.server_address[1], config.browser)
@@ -188,21 +209,24 @@ def run_view(
 
 
 def server_of(
-    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None
+    config: ViewConfig, run: Path, compare: Path | None, scene: Path | None, files: EditFiles | None = None
 ) -> tuple[ThreadingHTTPServer, Site]:
     """The server of a run's page, listening, and what it serves."""
     token = token_for(config.host, config.token)
     shown = find_shown(config, run, scene, compare)
     layers = list(LAYERS) if config.exact else []
-    page = page_of(config, shown, live={"layers": layers, "token": token})
+    desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
+    page = page_of(
+        config, shown, live={"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name}
+    )
     made = page.folder(*page.build())
-    files = {"" if name == "index.html" else name: content for name, content in made.items()}
+    served = {"" if name == "index.html" else name: content for name, content in made.items()}
     report = Path(run) / "report.html"
     if report.is_file():
-        files["report.html"] = store.read_bytes(report)
-    answers = {}
+        served["report.html"] = store.read_bytes(report)
+    answers: dict[str, Answer] = {"edits": lambda asked: desk.answer(parse_record(EditRequest, asked, "request"))}
     if config.exact:
-        source = FrameSource([model for _, model in shown.fits], config.width_px, drawing_device(config.device, "view"))
+        source = FrameSource(desk.edited, config.width_px, drawing_device(config.device, "view"))
         answers["frame"] = lambda asked: (source.png(parse_record(FrameRequest, asked, "request")), "image/png")
-    site = Site(files, answers, token)
+    site = Site(served, answers, token)
     return open_server(site, config.host, config.port), site

@@ -1,0 +1,197 @@
+// Edits made on the page: a list of entries of an edit script, shown at once by other paths of the nodes; undone, redone, saved. Behind
+// `mudg view` the server checks every script with the program's own reader and knows the paths of what the page cannot show itself.
+
+import { Ground, Motion, SHOWN, carriedOut, scriptText, summary, verbOf, withMove } from "mudg/edits";
+import { PoseKeys } from "mudg/math";
+
+const WAIT_MS = 350;
+const MOST_STEPS = 200;
+const FIELDS = { "edit-along": "along_m", "edit-left": "left_m", "edit-yaw": "yaw_deg" };
+const $ = (id) => document.getElementById(id);
+
+export class Editor {
+  constructor(app) {
+    this.app = app;
+    this.past = [];
+    this.future = [];
+    this.told = null; // what the server said of the entries
+    this.ground = app.ground ? new Ground(app.facts.ground, app.ground) : null;
+    for (const { scene } of app.loaded) for (const node of scene.nodes) node.recorded = node.pose;
+    for (const track of app.tracks) track.recorded = track.pose;
+    this.own = new Set(app.loaded[0].scene.nodes.filter((node) => node.pose).map((node) => node.name));
+    this.panel();
+    this.show(app.facts.live?.edits ?? []);
+  }
+
+  /** Whether an object can be moved: it has Gaussians of its own, or a server that cuts them out of the background. */
+  can(id) {
+    return this.own.has(id) || Boolean(this.app.facts.live);
+  }
+
+  // ---- the list ----
+
+  /** Shows other entries, without a step of undo. */
+  show(entries) {
+    const { app } = this;
+    app.state.edits = entries;
+    this.told = null;
+    this.apply();
+    this.list();
+    app.change({ edition: (app.state.edition ?? 0) + 1 });
+    this.ask();
+  }
+
+  /** Notes a step of undo. @param before entries before it. */
+  noted(before) {
+    if (before === this.app.state.edits) return;
+    this.past = [...this.past.slice(1 - MOST_STEPS), before];
+    this.future = [];
+    this.list();
+  }
+
+  /** Other entries as one step. */
+  set(entries) {
+    const before = this.app.state.edits;
+    this.show(entries);
+    this.noted(before);
+  }
+
+  undo() { this.step(this.past, this.future); }
+
+  redo() { this.step(this.future, this.past); }
+
+  step(from, to) {
+    if (!from.length) return;
+    to.push(this.app.state.edits);
+    this.show(from.pop());
+  }
+
+  move(id, by) { if (this.can(id)) this.set(withMove(this.app.state.edits, id, by)); }
+
+  remove(id) {
+    if (!this.can(id)) return;
+    this.app.state.selected = null;
+    this.set([...this.app.state.edits, { remove: { ids: [id] } }]);
+  }
+
+  stop(id) {
+    const at = this.app.state.t + this.app.facts.begin_s;
+    if (this.can(id)) this.set([...this.app.state.edits, { stop: { id, at_s: Math.round(at * 1000) / 1000 } }]);
+  }
+
+  /** The last entry if it moves this object for good. */
+  lastMove(id) {
+    const { edits } = this.app.state, [verb, given] = edits.length ? verbOf(edits[edits.length - 1]) : [];
+    return verb === "move" && given.id === id && (given.from_s ?? null) === null ? given : null;
+  }
+
+  // ---- what the page shows ----
+
+  /** Gives every node and box the path that the entries leave it. */
+  apply() {
+    const { app } = this, { edits } = app.state;
+    const path = (one, name) => {
+      const found = carriedOut(edits, name, one.recorded, this.ground, app.facts.begin_s), server = found.unknown && this.told;
+      one.removed = found.removed || Boolean(server && server.removed.includes(name));
+      const said = server && server.paths[name];
+      one.pose = said ? told(said, one.recorded) : found.motion.positions === one.recorded.positions ? one.recorded : found.motion;
+    };
+    for (const { scene } of app.loaded) for (const node of scene.nodes) if (node.recorded) path(node, node.name);
+    for (const track of app.tracks) path(track, track.id);
+  }
+
+  /** Has the server check the entries, and takes from it what the page cannot compute. */
+  ask() {
+    clearTimeout(this.timer);
+    const { live } = this.app.facts, { edits } = this.app.state;
+    this.problem("");
+    $("edit-notes").textContent = live || edits.every((entry) => SHOWN.includes(verbOf(entry)[0])) ? "" : "Some of these edits show only in mudg view.";
+    if (!live) return;
+    this.timer = setTimeout(async () => {
+      try {
+        const said = await this.post({ script: scriptText(edits), save: false });
+        if (edits !== this.app.state.edits) return;
+        this.told = said;
+        $("edit-notes").textContent = said.notes.join(". ");
+        this.apply();
+        this.app.change({ edition: this.app.state.edition + 1 });
+      } catch (error) {
+        if (edits === this.app.state.edits) this.problem(error.message);
+      }
+    }, WAIT_MS);
+  }
+
+  async post(body) {
+    const answer = await fetch("edits", { method: "POST", headers: { "Content-Type": "application/json", "X-Mudg-Token": this.app.facts.live.token }, body: JSON.stringify(body) });
+    if (!answer.ok) throw new Error(await answer.text());
+    return answer.json();
+  }
+
+  problem(text) {
+    this.wrong = Boolean(text);
+    $("edit-problem").textContent = text;
+    $("edit-problem").hidden = !text;
+  }
+
+  /** Has the server write the script; the sentence to show. */
+  async saveThere() {
+    try {
+      return `Saved ${(await this.post({ script: scriptText(this.app.state.edits, this.app.state.hidden), save: true })).saved}`;
+    } catch (error) {
+      this.problem(error.message);
+      return "Not saved: see Edits.";
+    }
+  }
+
+  // ---- the panel ----
+
+  panel() {
+    const { app } = this, id = () => app.state.selected;
+    $("undo").onclick = () => this.undo();
+    $("redo").onclick = () => this.redo();
+    $("edit-remove").onclick = () => this.remove(id());
+    $("edit-stop").onclick = () => this.stop(id());
+    for (const [field, name] of Object.entries(FIELDS)) {
+      $(field).onchange = ({ target }) => {
+        const value = Number(target.value), last = this.lastMove(id()), { edits } = app.state;
+        if (!Number.isFinite(value)) return;
+        const settings = { id: id(), ...last, [name]: value };
+        this.set([...(last ? edits.slice(0, -1) : edits), { move: settings }]);
+      };
+    }
+    app.listeners.add(() => this.fields());
+  }
+
+  /** Fields of the selected object. */
+  fields() {
+    const { selected } = this.app.state, shown = selected !== null && this.can(selected);
+    $("edit-object").hidden = !shown;
+    $("edit-hint").hidden = shown;
+    $("edit-hint").textContent = selected !== null && !shown ? "This object is part of the background of the fit: mudg edit can move it." : "Select an object, in the picture or in the list.";
+    if (!shown) return;
+    $("edit-name").textContent = selected;
+    const last = this.lastMove(selected);
+    for (const [field, name] of Object.entries(FIELDS)) if (document.activeElement !== $(field)) $(field).value = String(last?.[name] ?? 0);
+  }
+
+  list() {
+    const { edits } = this.app.state;
+    $("edit-count").textContent = edits.length ? String(edits.length) : "";
+    $("undo").disabled = !this.past.length;
+    $("redo").disabled = !this.future.length;
+    $("edit-list").replaceChildren(...edits.map((entry, k) => {
+      const item = document.createElement("li"), text = document.createElement("span"), drop = document.createElement("button");
+      text.textContent = summary(entry);
+      Object.assign(drop, { type: "button", textContent: "\u00d7", onclick: () => this.set(edits.filter((_, i) => i !== k)) });
+      drop.setAttribute("aria-label", `Drop the edit: ${summary(entry)}`);
+      item.append(text, drop);
+      return item;
+    }));
+  }
+}
+
+/** A path as the server says it. */
+function told({ rows, source }, recorded) {
+  const keys = new PoseKeys(rows.flat());
+  return new Motion(keys.times, keys.positions, keys.turns, source, recorded.times);
+}

@@ -1,0 +1,195 @@
+"""Edits made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a script."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import Field
+
+from mudg.base import store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.records import StrictRecord
+from mudg.base.types import FusedCloud, Scene
+from mudg.core.edit import Motion
+from mudg.data.edits import EditScript, parse_edits, read_edits
+from mudg.models.scene.edited import motion_of
+from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
+from mudg.report.viewer.facts import begin_of
+from mudg.report.viewer.packed import key_rows
+from mudg.stages.editing.carried import EditedDrive, carry_out
+
+MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
+"""First line of a saved script; a file without it belongs to somebody else."""
+NAME: Final = "edits.yaml"
+MOST_LETTERS: Final = 1_000_000
+SEALED: Final = (store.MANIFEST, "run.json", "model.json")
+"""A folder that holds one of these is the result of a command: nothing is added to it."""
+KEPT: Final = 2
+"""Scripts whose edited scenes stay in memory: that of the picture, and the one before."""
+
+
+@dataclass(frozen=True, slots=True)
+class EditFiles:
+    """The script that a page begins with, where edits are saved (None: beside the run), and whether a foreign file may be replaced."""
+
+    script: Path | None = None
+    out: Path | None = None
+    overwrite: bool = False
+
+
+class EditRequest(StrictRecord):
+    """A script, as ``assets/viewer/edits.js`` writes it; ``save`` also writes the file."""
+
+    script: Annotated[str, Field(max_length=MOST_LETTERS)]
+    save: bool = False
+
+
+@dataclass(slots=True)
+class EditDesk:
+    """Carries out scripts on what a page shows.
+
+    Args:
+        models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page begins with.
+        place: file to save to. overwrite: even if it is not one of ours.
+    """
+
+    models: Sequence[SceneModel]
+    scene: Scene
+    cloud: FusedCloud | None
+    place: Path
+    begin: EditScript | None = None
+    overwrite: bool = False
+    _made: dict[str, tuple[EditedDrive, list[SceneModel]]] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def entries(self) -> list[dict[str, Any]]:
+        """The edits that the page begins with, as [{verb: settings}] with absolute paths."""
+        if self.begin is None:
+            return []
+        return [
+            {e.verb: e.settings.model_dump(mode="json", by_alias=True, exclude_unset=True)}
+            for e in self._absolute(self.begin).edits
+        ]
+
+    def _absolute(self, script: EditScript) -> EditScript:
+        """The script with absolute paths: it may be saved elsewhere."""
+        return parse_edits(script.text(), "edits", Path()) if script.files() else script
+
+    def edited(self, text: str) -> list[SceneModel]:
+        """The fits with a script carried out; as they are where it is empty.
+
+        Raises:
+            InputError: it cannot be carried out; the message names line, verb and field.
+        """
+        return self._carried(text)[1] if text.strip() else list(self.models)
+
+    def _carried(self, text: str) -> tuple[EditedDrive, list[SceneModel]]:
+        with self._lock:
+            if text not in self._made:
+                script = parse_edits(text, NAME)
+                known = (
+                    {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
+                )
+                foreign = sorted(set(script.files()) - known)
+                if foreign:
+                    raise InputError("a page may name no files but those of --edits", where=NAME, got=foreign[0],
+                        remedy="write them into the script by hand")  # fmt: skip
+                drive = carry_out(script, self.models[0], self.scene, self.cloud)
+                made = drive, [drive.model(model) for model in self.models]
+                self._made = {**dict(list(self._made.items())[-(KEPT - 1) :]), text: made}
+            return self._made[text]
+
+    def answer(self, asked: EditRequest) -> tuple[bytes, str]:
+        """What a script does, as JSON: paths of changed objects, who is gone, notes, the file that was saved."""
+        said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
+        if asked.script.strip():
+            drive, _ = self._carried(asked.script)
+            said |= {
+                "paths": self._paths(drive), "removed": list(drive.plan.removed), "inserted": list(drive.plan.inserted),
+                "notes": [note["text"] for note in drive.notes] + _unseen(drive),
+            }  # fmt: skip
+        if asked.save:
+            said["saved"] = str(self.save(asked.script))
+        return store.json_text(said, indent=None).encode(), "application/json"
+
+    def _paths(self, drive: EditedDrive) -> dict[str, Any]:
+        """Keys of changed objects: ``rows`` as in ``key_rows``, ``source`` the moments of the recording that they show."""
+        begin = begin_of(self.scene)
+        nodes = {node.name: node for node in self.models[0].nodes if isinstance(node, RigidNode)}
+
+        def record(motion: Motion) -> dict[str, Any]:
+            return {
+                "rows": key_rows(motion.times_s - begin, motion.poses).tolist(),
+                "source": (motion.source_s - begin).tolist(),
+            }
+
+        changed = {
+            name: drive.plan.changed(name, motion_of(nodes[name])) for name in drive.plan.changes if name in nodes
+        }
+        standing = {name: drive.plan.after.actors[name].motion for name in drive.plan.touched() if name not in changed}
+        return {name: record(motion) for name, motion in {**changed, **standing}.items()}
+
+    def save(self, text: str) -> Path:
+        """Write the script.
+
+        Raises:
+            InputError: there is nothing to save, or the file belongs to somebody else.
+        """
+        if not text.strip():
+            raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
+        if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
+            raise InputError("the file was not written by mudg view", where=str(self.place),
+                remedy="start mudg view with another --edits-out, or add --overwrite")  # fmt: skip
+        store.atomic_write(self.place, (MARK + text).encode())
+        return self.place
+
+
+def _unseen(drive: EditedDrive) -> list[str]:
+    """What exact frames do not show of a script."""
+    said = []
+    if drive.plan.conditions:
+        said.append(f"{', '.join(drive.plan.conditions)}: mudg render shows it, this page does not")
+    if drive.plan.moves_ego:
+        said.append(
+            "the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"
+        )
+    return said
+
+
+def desk_for(
+    models: Sequence[SceneModel], scene: Scene, cloud: FusedCloud | None, run: Path, files: EditFiles
+) -> EditDesk:
+    """What carries out the edits of a page.
+
+    Raises:
+        InputError: the script cannot be carried out. UsageError: edits would be saved into a finished result.
+    """
+    begin = None if files.script is None else read_edits(files.script)
+    desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite)
+    if begin is not None:
+        carry_out(begin, models[0], scene, cloud)
+    return desk
+
+
+def place_for(run: Path, given: Path | None) -> Path:
+    """Where edits of a run are saved: the given file, else beside the run, else in the current folder.
+
+    Raises:
+        UsageError: the given file lies in the result of a command.
+    """
+    if given is not None:
+        if _sealed(given) or given.is_dir():
+            raise UsageError("edits are not saved into the result of a command", where="--edits-out", got=str(given),
+                expected="a file outside of runs")  # fmt: skip
+        return given
+    beside = Path(run).resolve().parent / NAME
+    return Path(NAME) if _sealed(beside) else beside
+
+
+def _sealed(path: Path) -> bool:
+    return any((folder / name).is_file() for folder in path.resolve().parents for name in SEALED)

@@ -1,0 +1,304 @@
+"""Edits on the viewer's page: what the server carries out and saves, and that the page shows what ``mudg render --edits`` draws."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import CHROMIUM, NO_BROWSER, Browser
+from toy_fitted import STREET, write_toy_run
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.core.ground import HeightMap
+from mudg.core.trajectory import at_shift
+from mudg.data.edits import parse_edits, read_edits
+from mudg.data.scene import read_scene
+from mudg.models.scene.edited import motion_of
+from mudg.models.scene.model import SceneModel
+from mudg.report.viewer.facts import UNKNOWN, PageFacts, with_ground
+from mudg.stages.config.view import PageConfig
+from mudg.stages.editing.carried import carry_out
+from mudg.stages.fitting.rendering import raster_of, render_view
+from mudg.stages.viewing import edits as desk_module
+from mudg.stages.viewing import view
+from mudg.stages.viewing.edits import MARK, EditDesk, EditFiles, EditRequest, desk_for, place_for
+from mudg.stages.viewing.frames import FrameRequest, FrameSource
+
+Toy = tuple[Path, Path, SceneModel]
+SCRIPT = "- move: {id: car-1, along_m: 1.5, left_m: 1, yaw_deg: 20}\n"
+PERSON = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
+    root = tmp_path_factory.mktemp("edits")
+    _, fit, _, model = write_toy_run(root)
+    return root, fit, model
+
+
+def desk_of(toy: Toy, out: Path, script: Path | None = None, overwrite: bool = False) -> EditDesk:
+    scene = read_scene(toy[0] / "scene")
+    return desk_for([toy[2]], scene, None, toy[1], EditFiles(script, out, overwrite))
+
+
+def said(desk: EditDesk, script: str, save: bool = False) -> dict:
+    return json.loads(desk.answer(EditRequest(script=script, save=save))[0])
+
+
+def test_the_server_says_the_paths_of_the_edited_fit(toy: Toy, tmp_path: Path) -> None:
+    desk = desk_of(toy, tmp_path / "edits.yaml")
+    found = said(desk, SCRIPT)
+    (edited,) = desk.edited(SCRIPT)
+    car = next(node for node in edited.nodes if node.name == "car-1")
+    rows = np.array(found["paths"]["car-1"]["rows"])
+    assert np.abs(rows[:, 1:4] - motion_of(car).poses[:, :3, 3]).max() < 1e-5
+    assert (found["removed"], found["saved"]) == ([], None)
+    assert said(desk, SCRIPT + "- remove: {class: car}\n")["removed"] == ["car-1"]
+    assert not (tmp_path / "edits.yaml").exists()
+    assert said(desk, "")["paths"] == {}
+
+
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        ("- move: {id: car-9}\n", "line 1: move.id"),
+        ("- remove: {ids: [car-1]}\n- move: {id: car-1, sideways: 2}\n", "line 2: move"),
+        ("- jump: {}\n", "verb"),
+        ("- [\n", "YAML"),
+        ("- sky: {image: /etc/hostname}\n", "no files"),
+    ],
+)
+def test_a_wrong_script_is_told_with_its_line(toy: Toy, tmp_path: Path, script: str, told: str) -> None:
+    desk = desk_of(toy, tmp_path / "edits.yaml")
+    with pytest.raises(InputError) as caught:
+        said(desk, script, save=False)
+    assert told.lower() in str(caught.value).lower()
+
+
+def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path) -> None:
+    import io
+
+    from PIL import Image
+
+    desk, model = desk_of(toy, tmp_path / "edits.yaml"), toy[2]
+    wanted = STREET.view(0.4, 80, 48)
+    pose, camera = wanted.world_from_cam, wanted.camera
+    asked = FrameRequest(
+        scene=0, layer="color", time_s=0.4, hidden=[], edits=SCRIPT, camera="front", width=80, height=48, fx=camera.fx, fy=camera.fy,
+        cx=camera.cx, cy=camera.cy, eye=pose[:3, 3].tolist(), axes=pose[:3, :3].T.tolist(),
+    )  # fmt: skip
+    seen = np.asarray(Image.open(io.BytesIO(FrameSource(desk.edited, 1600, torch.device("cpu")).png(asked)))) / 255.0
+    drive = carry_out(parse_edits(SCRIPT, "edits.yaml"), model, read_scene(toy[0] / "scene"))
+    true = render_view(drive.model(model), wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
+    plain = render_view(model, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
+    assert np.abs(seen - true).max() < 0.003
+    assert np.abs(seen - plain).max() > 0.1
+
+
+def test_edits_are_saved_as_a_script_and_replace_only_their_own_file(toy: Toy, tmp_path: Path) -> None:
+    place = tmp_path / "edits.yaml"
+    desk = desk_of(toy, place)
+    assert said(desk, SCRIPT, save=True)["saved"] == str(place)
+    assert place.read_text().startswith(MARK)
+    said(desk, SCRIPT + SCRIPT, save=True)
+    assert [edit.verb for edit in read_edits(place).edits] == ["move", "move"]
+    place.write_text("- remove: {ids: [car-1]}\n")
+    with pytest.raises(InputError, match="not written by mudg view"):
+        said(desk, SCRIPT, save=True)
+    assert "remove" in place.read_text()
+    said(desk_of(toy, place, overwrite=True), SCRIPT, save=True)
+    with pytest.raises(InputError, match="no edits"):
+        said(desk, "", save=True)
+
+
+def test_edits_are_never_saved_into_a_result(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert place_for(toy[1], None) == toy[1].resolve().parent / "edits.yaml"
+    (tmp_path / "run" / "fit" / "a").mkdir(parents=True)
+    (tmp_path / "run" / "run.json").write_text("{}")
+    assert place_for(tmp_path / "run" / "fit" / "a", None) == Path("edits.yaml")
+    assert place_for(tmp_path / "run", None) == tmp_path / "edits.yaml"
+    with pytest.raises(UsageError, match="edits-out"):
+        place_for(toy[1], tmp_path / "run" / "fit" / "mine.yaml")
+
+
+def test_a_page_begins_with_a_script(toy: Toy, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("# a note\n- move: {id: car-1, left_m: 2}\n- stop: {id: car-1, at_s: 0.3}\n")
+    desk = desk_of(toy, tmp_path / "edits.yaml", tmp_path / "mine.yaml")
+    assert desk.entries() == [{"move": {"id": "car-1", "left_m": 2.0}}, {"stop": {"id": "car-1", "at_s": 0.3}}]
+    (tmp_path / "mine.yaml").write_text("- move: {id: nobody}\n")
+    with pytest.raises(InputError, match="nobody"):
+        desk_of(toy, tmp_path / "edits.yaml", tmp_path / "mine.yaml")
+
+
+def test_heights_of_the_ground_are_kept_within_a_millimetre() -> None:
+    heights = np.array([[0.0, 0.5], [np.nan, 12.0]])
+    page = with_ground(PageFacts({}, {}, b""), HeightMap(np.zeros(2), 0.5, heights))
+    facts, levels = page.facts["ground"], page.sections["ground"]
+    assert levels[1, 0] == UNKNOWN
+    known = np.isfinite(heights)
+    assert np.abs(facts["low"] + facts["step"] * levels[known] - heights[known]).max() < 1e-3
+    assert with_ground(PageFacts({}, {}, b""), None).facts["ground"] is None
+
+
+# in a browser --------------------------------------------------------------------------------------------------------
+
+
+def hilly() -> HeightMap:
+    """Ground with slopes, and with a part that is not known."""
+    x, y = np.meshgrid(np.arange(-20, 60, 0.5), np.arange(-20, 20, 0.5), indexing="ij")
+    heights = 0.3 * np.sin(x / 4) + 0.02 * y**2
+    heights[y < -6] = np.nan
+    return HeightMap(np.array([-20.0, -20.0]), 0.5, heights)
+
+
+@pytest.fixture(scope="module")
+def opened(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    root = tmp_path_factory.mktemp("page")
+    made = view.page_of(PageConfig(images=0), view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]),)))
+    made = replace(made, log=with_ground(made.log, hilly()))
+    (root / "page.html").write_bytes(made.one_file(*made.build()))
+    one = Browser(tmp_path_factory.mktemp("profile"), size=(900, 600))
+    try:
+        one.open(f"file://{root / 'page.html'}#m=recorded&c=front&t=0.4")
+        yield one
+    finally:
+        one.close()
+
+
+SCRIPTS = (
+    SCRIPT,
+    "- move: {id: car-1, along_m: -2, left_m: 1.2, up_m: 0.1, yaw_deg: -70, ground: false}\n",
+    "- move: {id: car-1, left_m: 3, from_s: 0.2, ramp_s: 0.3}\n- stop: {id: car-1, at_s: 0.3, brake_m_s2: 6}\n",
+    "- stop: {id: car-1, at_s: 0.2}\n- move: {id: car-1, left_m: -9}\n",
+    f"- move: {{id: '{PERSON}', along_m: 0.5, yaw_deg: 45}}\n- stop: {{id: '{PERSON}', at_s: 0.5}}\n",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_the_page_moves_objects_as_the_program_does(
+    opened: Browser, toy: Toy, script: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, scene = toy[2], read_scene(toy[0] / "scene")
+    monkeypatch.setattr("mudg.stages.editing.carried.ground_of", lambda cloud, model: hilly())
+    drive = carry_out(parse_edits(script, "edits.yaml"), model)
+    edited = drive.model(model)
+    entries = [
+        {e.verb: e.settings.model_dump(mode="json", by_alias=True, exclude_unset=True)} for e in drive.script.edits
+    ]
+    opened.run(f"window.mudg.editor.set({json.dumps(entries)}); 1")
+    for name in ("car-1", PERSON):
+        motion = motion_of(next(node for node in edited.nodes if node.name == name))
+        for t in np.linspace(motion.times_s[0], motion.times_s[-1], 23):
+            shown = opened.run(
+                f"(() => {{ const p = window.mudg.loaded[0].scene.nodes.find((n) => n.name === {json.dumps(name)})"
+                f".pose.at({float(t) - scene.frames[0].view.time_s}); return [...p.position, ...p.rotation]; }})()"
+            )
+            true = motion.pose_at(float(t))
+            assert np.abs(np.array(shown[:3]) - true[:3, 3]).max() < 2e-3, (name, t)
+            assert np.abs(np.array(shown[3:]).reshape(3, 3) - true[:3, :3]).max() < 2e-3, (name, t)
+    wanted = next(v for v in at_shift(scene, "front", 0.0).views if abs(v.time_s - 0.6) < 1e-6)
+    true = render_view(edited, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
+    seen = opened.measure(["color"], camera="front", t=0.6)["color"][..., :3] / 255.0
+    assert -10 * np.log10(np.square(seen - true).mean()) >= 38
+    opened.run("window.mudg.editor.undo(); 1")
+    assert opened.run("window.mudg.state.edits.length") == 0
+    assert opened.errors == []
+
+
+PRESS = """(type, x, y, id = 1) => document.getElementById('stage').dispatchEvent(
+  new PointerEvent(type, {clientX: x, clientY: y, pointerId: id, bubbles: true}))"""
+HANDLES = """(() => { const app = window.mudg, {view, area, ratio} = app.last, box = app.stage.getBoundingClientRect(), found = {};
+  for (const [name, [x, y]] of Object.entries(app.gizmo.handles(view, app.gizmo.frame())))
+    found[name] = [box.left + (x + area[0]) / ratio, box.top + (y + area[1]) / ratio];
+  return found; })()"""
+
+
+@pytest.mark.slow
+def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, tmp_path: Path) -> None:
+    opened.run(
+        "document.getElementById('stage').setPointerCapture = () => {}; window.mudg.change({mode: 'top', height: 30, t: 0.4}); 1"
+    )
+    opened.wait("window.mudg.sharp")
+    middle = opened.run(
+        "(() => { const app = window.mudg, track = app.tracks.find((one) => one.id === 'car-1'); app.state.selected = 'car-1';"
+        f"const found = {HANDLES}; app.state.selected = null; return found.free; }})()"
+    )
+    opened.run(
+        f"(({PRESS})('pointerdown', {middle[0]}, {middle[1]}), ({PRESS})('pointerup', {middle[0]}, {middle[1]}), 1)"
+    )
+    assert opened.run("window.mudg.state.selected") == "car-1"
+    places = opened.run(HANDLES)
+    (x0, y0), (x1, y1) = places["free"], places["along"]
+    drag = [("pointerdown", x1, y1), ("pointermove", x1 + (x1 - x0), y1 + (y1 - y0)), ("pointerup", x1, y1)]
+    for kind, x, y in drag:
+        opened.run(f"(({PRESS})('{kind}', {x}, {y}), 1)")
+    ((verb, given),) = opened.run("window.mudg.state.edits")[0].items()
+    size = opened.run("window.mudg.tracks.find((one) => one.id === 'car-1').size_m[0]")
+    assert verb == "move" and set(given) == {"id", "along_m"}
+    assert abs(given["along_m"] - (size / 2 + 0.9)) < 0.15  # the picture has perspective
+    opened.wait("window.mudg.sharp")
+    x, y = opened.run(HANDLES)["yaw"]
+    opened.run(
+        f"(({PRESS})('pointerdown', {x}, {y}), ({PRESS})('pointermove', {x - 30}, {y}), ({PRESS})('pointerup', {x}, {y}), 1)"
+    )
+    edits = opened.run("window.mudg.state.edits")
+    assert len(edits) == 1 and abs(edits[0]["move"]["yaw_deg"]) > 3
+    key = "(key, more = {}) => document.body.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true, ...more}))"
+    opened.run(f"(({key})('ArrowLeft', {{shiftKey: true}}), ({key})('<', {{shiftKey: true}}), 1)")
+    assert opened.run("window.mudg.state.edits[0].move.yaw_deg") == pytest.approx(edits[0]["move"]["yaw_deg"] + 1)
+    text = opened.run("import('mudg/share').then((share) => share.editScript(window.mudg.state))")
+    assert parse_edits(text, "edits.yaml").edits[0].settings.id == "car-1"
+    for _ in range(4):
+        opened.run(f"(({key})('z', {{ctrlKey: true}}), 1)")
+    assert opened.run("window.mudg.state.edits") == []
+    opened.run(f"(({key})('y', {{ctrlKey: true}}), ({key})('Delete'), 1)")
+    assert [list(edit) for edit in opened.run("window.mudg.state.edits")] == [["move"], ["remove"]]
+    without = opened.measure(["class"], camera="front", t=0.4)["class"]
+    assert (without == ID["car"]).sum() == 0
+    opened.run("window.mudg.editor.set([]); 1")
+    assert opened.errors == []
+
+
+@pytest.mark.slow
+def test_a_page_with_a_server_checks_and_saves(toy: Toy, tmp_path: Path) -> None:
+    import threading
+
+    from mudg.stages.config.view import ViewConfig
+
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    (tmp_path / "mine.yaml").write_text("- speed: {id: car-1, factor: 0.5}\n")
+    files = EditFiles(tmp_path / "mine.yaml", tmp_path / "edits.yaml")
+    config = ViewConfig(images=0, browser=False, device="cpu")
+    server, site = view.server_of(config, toy[1], None, toy[0] / "scene", files)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    one = Browser(tmp_path / "profile", size=(700, 500))
+    try:
+        one.open(view.address_of(server, site) + "#m=recorded&c=front&t=0.6")
+        one.wait("window.mudg.editor.told !== null")
+        drive = carry_out(read_edits(tmp_path / "mine.yaml"), toy[2], read_scene(toy[0] / "scene"))
+        true = motion_of(next(n for n in drive.model(toy[2]).nodes if n.name == "car-1")).pose_at(0.6)
+        shown = one.run("window.mudg.loaded[0].scene.nodes.find((n) => n.name === 'car-1').pose.at(0.6).position")
+        assert np.abs(np.array(shown) - true[:3, 3]).max() < 1e-3
+        one.run("window.mudg.editor.set([...window.mudg.state.edits, {move: {id: 'nobody', left_m: 1}}]); 1")
+        one.wait("!document.getElementById('edit-problem').hidden")
+        assert "line 2: move.id" in one.run("document.getElementById('edit-problem').textContent")
+        one.run("window.mudg.editor.undo(); 1")
+        one.run("document.getElementById('edits').click(); 1")
+        one.wait("document.getElementById('note').textContent.startsWith('Saved')")
+        assert (tmp_path / "edits.yaml").read_text() == desk_module.MARK + '- speed: {id: "car-1", factor: 0.5}\n'
+        one.wait("!document.getElementById('exact').hidden")
+    finally:
+        one.close()
+        server.shutdown()
+        server.server_close()
