@@ -33,6 +33,7 @@ from mudg.models.published.model import PublishedMDM
 from mudg.stages import edit, fit, render, synthesize
 from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
 from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
+from mudg.stages.editing.harmonised_weather import corrected
 from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.vacated import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
 
@@ -297,6 +298,67 @@ def test_renders_are_repaired_where_the_edit_touches_them(run: Path, tmp_path: P
         assert not bool((differs & ~torch.from_numpy(near)).any())  # beside the car and its ground every bit stays
         assert torch.equal(new.semantics[~near], plain.semantics[~near])
     assert changed > 0
+
+
+def with_effects(run: Path) -> str:
+    """The tiny diffusion model with effects that are not zero."""
+    folder = run / "model_of_effects"
+    if not folder.is_dir():
+        torch.manual_seed(1)
+        model = MDM(replace(SMALL, effects=4))
+        with torch.no_grad():
+            for name, value in model.named_parameters():
+                if name.startswith("effects."):
+                    value.normal_(0, 0.5)
+        files.save(model, folder, "", {})
+    return str(folder)
+
+
+def test_weather_is_corrected_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
+    edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
+    plain = RenderConfig(shifts_m=(0.0,), video=False)
+
+    def rendered(name: str, model: str, strength: float) -> list[Observation]:
+        harmonize = HarmonizeConfig(on=True, model=model, steps=2, weather=strength)
+        config = replace(plain, harmonize=harmonize) if model else plain
+        return views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse"))
+
+    physical, kept = rendered("physical", "", 0.0), rendered("kept", with_effects(run), 0.0)
+    assert "--harmonize.weather is 0" in capsys.readouterr().err
+    unknown = rendered("unknown", str(run / "model"), 1.0)
+    assert "takes no effect vector" in capsys.readouterr().err
+    made = rendered("made", with_effects(run), 1.0)
+    assert len(made) == FRAMES
+    for before, one, two, new in zip(physical, kept, unknown, made, strict=True):
+        assert torch.equal(one.rgb, before.rgb)
+        assert torch.equal(two.rgb, before.rgb)
+        assert float((new.rgb - before.rgb).abs().mean()) > 0.01
+        assert torch.equal(new.semantics, before.semantics)
+
+
+@pytest.mark.slow
+def test_views_are_generated_in_weather_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
+    edits, folders = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse")
+    config = SynthesizeConfig(shifts_m=(0.0,), model=with_effects(run), steps=1, full_size=False, processes=1, precision="float32")
+    fitted = run / "fit" / "street_gaussians"
+    day = views_of(synthesize.run(config, *folders, tmp_path / "day", fitted=fitted))
+    night = views_of(synthesize.run(config, *folders, tmp_path / "night", fitted=fitted, edits=edits))
+    assert "show no weather" not in capsys.readouterr().err
+    assert not any(torch.equal(a.rgb, b.rgb) for a, b in zip(day, night, strict=True))
+    other = replace(config, model=str(run / "model"))
+    by_day = views_of(synthesize.run(other, *folders, tmp_path / "other_day", fitted=fitted))
+    still = views_of(synthesize.run(other, *folders, tmp_path / "other_night", fitted=fitted, edits=edits))
+    assert "show no weather" in capsys.readouterr().err
+    assert all(torch.equal(a.rgb, b.rgb) for a, b in zip(by_day, still, strict=True))
+
+
+def test_a_correction_keeps_the_detail_of_the_render() -> None:
+    generator = torch.Generator().manual_seed(2)
+    render_ = observed(0.2 + 0.5 * torch.rand(3, 32, 48, generator=generator), torch.full((32, 48), ID["road"]))
+    small = torch.nn.functional.interpolate(render_.rgb[None], size=(16, 24), mode="area")[0]
+    assert torch.allclose(corrected(render_, small).rgb, render_.rgb, atol=1e-6)
+    assert torch.allclose(corrected(render_, small + 0.1).rgb, render_.rgb + 0.1, atol=1e-6)
+    assert torch.allclose(corrected(render_, 1 - render_.rgb).rgb, 1 - render_.rgb, atol=1e-6), "at the model's own size: what it made"
 
 
 @pytest.mark.slow

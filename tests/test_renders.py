@@ -21,7 +21,7 @@ from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.condition import build_conditions
 from mudg.data.clips.from_city import CityClipRules
 from mudg.models.diffusion import SampleRequest
-from mudg.models.mdm import files
+from mudg.models.mdm import files, stacked
 from mudg.models.mdm import model as mdm
 from mudg.models.mdm.extended import extended
 
@@ -448,7 +448,7 @@ def test_no_render_is_told_from_an_empty_one():
     nothing = torch.zeros_like(plain.depth)
     empty = RenderPlanes(plain.color, plain.depth, nothing, nothing, torch.full_like(plain.valid, 255, dtype=torch.uint8))
     missing, blank = model.encode_condition(plain), model.encode_condition(replace(plain, renders=empty))
-    assert bool((missing.pixels.alpha == mdm.NO_RENDER).all()) and bool((blank.pixels.alpha == 0).all())
+    assert bool((missing.pixels.alpha == stacked.NO_RENDER).all()) and bool((blank.pixels.alpha == 0).all())
     differ = (missing.planes != blank.planes).flatten(3).any(3).any(1)[0]
     assert int(differ.sum()) == 1  # the plane of coverage alone
     both = model.encode_condition([plain, with_renders(plain)])

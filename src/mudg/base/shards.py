@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def write_shards(
-    folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None
+    folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None, stem: str = "weights"
 ) -> dict[str, str]:
-    """Write tensors, on any device, as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
+    """Write tensors, on any device, as `<stem>_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
 
     Args:
         folder: a tree under a temporary name (`store.atomic_directory`).
@@ -34,7 +34,7 @@ def write_shards(
     def flush() -> None:
         nonlocal shard, size
         if shard:
-            name = f"weights_{len(files):02d}.safetensors"
+            name = f"{stem}_{len(files):02d}.safetensors"
             store.write_in_tree(folder / name, safetensors_bytes(shard))
             files[name] = store.sha256_file(folder / name)
         shard, size = {}, 0

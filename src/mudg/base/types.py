@@ -416,6 +416,7 @@ class Condition:
         semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 = unknown.
         backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
         renders: what a fitted scene shows at the views, or None.
+        effect: f32[8] or None: weather and light that the colours have been given (``base.effects``).
     """
 
     views: tuple[View, ...]
@@ -428,12 +429,13 @@ class Condition:
     semantics: Tensor | None = None
     backdrop_semantics: Tensor | None = None
     renders: RenderPlanes | None = None
+    effect: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
         one = (t, 1, h, w)
         checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
-        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
+        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one, effect=(8,))
         if self.renders is not None:
             checks.check_tensors(self.renders, color=(t, 3, h, w))
 

@@ -46,7 +46,16 @@ from mudg.stages.learning import codec as learn_codec
 from mudg.stages.learning import parallel
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.clips import class_weights, draw_clips
-from mudg.stages.learning.models import Model, draw_weights, freeze, hold_finisher, kind_of, starting_model
+from mudg.stages.learning.models import (
+    Model,
+    check_effects,
+    draw_weights,
+    freeze,
+    hold_effects,
+    hold_finisher,
+    kind_of,
+    starting_model,
+)  # fmt: skip
 from mudg.stages.learning.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
 from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.scene_list import ListedShards, is_list, read_list
@@ -76,6 +85,7 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
+        check_effects(model, fresh, config)
         directory = _open(config, out, overwrite, ranks)
         if directory is None:
             return out / "model"
@@ -165,13 +175,14 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
             ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16, ranks.device))
             learn_codec.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
-        for name in ("refiner", "finisher"):
+        for name in ("refiner", "finisher", "effects"):
             part = getattr(model, name, None)
             if name in fresh and part is not None:
                 draw_weights(part, config.seed, f"{name} weights")
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
+        hold_effects(model, config.data.weathers)
         hold_finisher(model, fresh, learn_clips.have_patches(config, folder, config.data.skip_cities))
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 
@@ -262,7 +273,7 @@ def _train_network(
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
     weights = _class_weights(config, folder).to(ranks.device)
-    settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout)
+    settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout, config.data.effect_dropout)
     board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []

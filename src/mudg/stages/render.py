@@ -20,10 +20,11 @@ from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.palette import CLASSES
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
-from mudg.base.types import Scene, Trajectory
+from mudg.base.types import Observation, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
+from mudg.data.clips.weathered import InWeather
 from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript
 from mudg.data.exporters.video import write_mp4
@@ -35,7 +36,8 @@ from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
 from mudg.stages.editing.carried import FACT, EditedDrive, carry_out, read_and_digest
 from mudg.stages.editing.harmonised import EditedSources, Harmoniser, RepairedViews
-from mudg.stages.editing.weathered import Drawer, conditions_of, in_conditions
+from mudg.stages.editing.harmonised_weather import WeatherHarmoniser, harmonises_weather
+from mudg.stages.editing.weathered import Drawer, conditions_of, in_weather, weather_of
 from mudg.stages.fit import load_model, render_view
 from mudg.stages.fitting.rendering import raster_of
 from mudg.stages.fitting.storage import RADIANCE, kind_of
@@ -72,7 +74,7 @@ def run(
     refuse_overlap(out, {"scene": scene, "model": model, "edits": edits, "fused": fused, **named})
     if config.harmonize.on:
         inputs |= _harmonised_inputs(config, edits, fused)
-    radiance, repaired = kind_of(Path(model)) == RADIANCE, None
+    radiance, followers = kind_of(Path(model)) == RADIANCE, list[RepairedViews]()
     if radiance and (config.remove_tracks or script is not None):
         raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
             remedy="leave --remove-tracks and --edits out")  # fmt: skip
@@ -88,16 +90,22 @@ def run(
         loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
         if config.harmonize.on and drive is not None:
-            draw = repaired = _repaired(config, (drive, fitted), (Path(scene), Path(model)), draw)
+            draw = _repaired(config, (drive, fitted), (Path(scene), Path(model)), draw)
+            followers.append(draw)
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
-        draw = draw if conditions is None else in_conditions(draw, conditions, loaded)
+        if conditions is not None:
+            how = weather_of(draw, conditions, loaded)
+            draw = in_weather(draw, how)
+            if config.harmonize.on and drive is not None and harmonises_weather(config.harmonize, how):
+                draw = _corrected(config, (drive, fitted), Path(scene), (draw, how))
+                followers.append(draw)
     paths = trajectories(loaded, config)
     _require_memory(paths)
     try:
         with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
             for path in paths:
-                if repaired is not None:
-                    repaired.follow(path)
+                for follower in followers:
+                    follower.follow(path)
                 _render_trajectory(draw, path, folder.path / path.name, source, bar)
                 if config.video:
                     _write_video(folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps)
@@ -153,6 +161,23 @@ def _repaired(
     camera = trajectories(recorded, config)[0].views[0].camera
     harmoniser = Harmoniser(EditedSources.of(drive, fitted, recorded), config.harmonize, (camera.width, camera.height), config.device)
     return RepairedViews(harmoniser, lambda view: (usual(view), draw(view)))
+
+
+def _corrected(
+    config: RenderConfig, edited: tuple[EditedDrive, SceneModel], scene: Path, drawn: tuple[Drawer, InWeather]
+) -> RepairedViews:
+    """What draws views in other weather, corrected by the diffusion model; ``drawn``: what draws them by the formulas."""
+    (drive, fitted), (draw, how) = edited, drawn
+    recorded = scene_seen_by(read_scene(scene), fitted.facts)
+    camera = trajectories(recorded, config)[0].views[0].camera
+    sources = EditedSources.of(drive, fitted, recorded)
+    harmoniser = WeatherHarmoniser(sources, how, config.harmonize, (camera.width, camera.height), config.device)
+
+    def pair(view: View) -> tuple[Observation, Observation]:
+        made = draw(view)
+        return made, made
+
+    return RepairedViews(harmoniser, pair)
 
 
 def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:

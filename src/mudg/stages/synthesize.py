@@ -28,6 +28,7 @@ from torch.nn import functional
 
 from mudg.base import log, palette, store
 from mudg.base.config import result_settings
+from mudg.base.effects import effect_vector
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
@@ -44,13 +45,16 @@ from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_label, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
 from mudg.models.mdm.codec import Modality
-from mudg.models.mdm.files import digest, folder_of
+from mudg.models.mdm.files import digest, folder_of, takes_effects
 from mudg.models.mdm.model import MDM
+from mudg.models.published.files import is_published
 from mudg.stages import fuse
 from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages.editing import weathered as editing_weather
 from mudg.stages.editing.carried import read_and_digest
 from mudg.stages.editing.vacated import DriveOfEdits, drive_of_edits, photos_of_edited, vacated_at
 from mudg.stages.fitting.planes import render_planes
+from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.learning import loading
 
@@ -129,7 +133,14 @@ def _edited(config: SynthesizeConfig, script: EditScript, given: tuple[Scene, Pa
     if config.condition == FREEVS:
         raise UsageError("this condition is made of recorded sweeps, which show no edits", where="--condition", got=FREEVS,
             remedy="edit a whole run with `mudg edit` and give its scene")  # fmt: skip
-    return drive_of_edits(script, scene, read_fused(fused), None if fitted is None else load_model(fitted), told=True)
+    told = not shows_weather(config, script, fitted is not None)
+    return drive_of_edits(script, scene, read_fused(fused), None if fitted is None else load_model(fitted), told=told)
+
+
+def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
+    """Whether views are generated in the weather and light of a script: from renders of a fit, by a model that takes an effect vector."""
+    wanted = effect_vector(editing_weather.conditions_of(script.canonical())) is not None and fitted and config.condition == "full"
+    return wanted and not is_published(config.model) and takes_effects(config.model)
 
 
 def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
@@ -255,11 +266,14 @@ def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, mo
     """What makes the views of one trajectory."""
     scene, cloud = read_scene(given.scene), read_fused(given.fused)
     fit = None if given.fitted is None else load_model(given.fitted)
-    recorded, vacated = recorded_images(scene, config), None
+    recorded, vacated, weather = recorded_images(scene, config), None, None
     if given.script is not None:
         drive = drive_of_edits(given.script, scene, cloud, fit)
         scene, cloud, fit, recorded = drive.scene, drive.cloud, drive.model, photos_of_edited(recorded, drive.plan)
         vacated = vacated_at(drive.plan)
+        asked = editing_weather.conditions_of(given.script.canonical())
+        if asked is not None and fit is not None and shows_weather(config, given.script, True):
+            weather = editing_weather.weather_of(functools.partial(render_view, fit, raster=raster_of(fit)), asked, scene)
     cloud = cloud if config.given_classes else without_classes(cloud)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
@@ -269,7 +283,7 @@ def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, mo
     rules = rules if given.script is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
     render_at = None if fit is None else functools.partial(render_planes, fit)
     near = near_sweeps(scene, cloud, path) if config.condition == FREEVS else None
-    return ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near, vacated), config)
+    return ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near, vacated, weather), config)
 
 
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:

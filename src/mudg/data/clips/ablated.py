@@ -18,6 +18,7 @@ from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition
 from mudg.data.clips.vacated import VacatedAt
+from mudg.data.clips.weathered import InWeather, weathered
 
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
@@ -32,7 +33,7 @@ COVERED = 0.5
 @dataclass(frozen=True, slots=True)
 class ConditionSources:
     """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the log's
-    sweeps, where they are needed; of an edited drive also where something stood that is not there any more."""
+    sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and its weather."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
@@ -41,6 +42,7 @@ class ConditionSources:
     render_at: RenderAt | None = None
     near: NearSweeps | None = None
     vacated_at: VacatedAt | None = None
+    weather: InWeather | None = None
 
 
 def conditions_of(
@@ -59,7 +61,8 @@ def conditions_of(
         condition = near_condition(sources.near, views, rules)
         return condition, condition
     if parts == "full":
-        return build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at, sources.vacated_at)
+        small, fine = build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at, sources.vacated_at)
+        return (small, fine) if sources.weather is None else in_weather(small, fine, sources.weather)
     if parts == "repair":
         return _of_renders(sources, views, kept)
     points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)
@@ -68,6 +71,12 @@ def conditions_of(
     images = build_conditions(cloud, tracks, views, recorded, replace(rules, images_per_view=1), kept)
     small, fine = (_with_backdrop(a, b, rules, parts) for a, b in zip(points, images, strict=True))
     return small, fine
+
+
+def in_weather(small: Condition, fine: Condition, how: InWeather) -> tuple[Condition, Condition]:
+    """A condition and the same on the fine grid in other weather or light."""
+    made = weathered(small, how)
+    return made, made if fine is small else weathered(fine, how)
 
 
 def _of_renders(

@@ -15,6 +15,8 @@ and, where a fitted scene was rendered,
     render u8[K,T,3,H,W]  render_depth f16[K,T,H,W]  alpha, certainty u8[K,T,H,W] (of 255)  render_ids u8[K,T,H,W]
     rendered bool[K]: false = this clip has no renders
 
+and, of clips in other weather or light, effect f32[K,8] (`base.effects`)
+
 and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column, scale).
 """
 
@@ -32,6 +34,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from mudg.base import seeds, store
+from mudg.base.effects import EFFECTS
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Camera, Clip, Condition, FinePatch, View
@@ -103,6 +106,9 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
             "render_ids": np.stack([r.semantics[:, 0].numpy() for r in shown]),
             "rendered": np.array([c.renders is not None for c in conditions]),
         }  # fmt: skip
+    if any(c.effect is not None for c in conditions):
+        nothing = torch.zeros(len(EFFECTS))
+        arrays["effect"] = np.stack([(nothing if c.effect is None else c.effect).numpy() for c in conditions])
     patches = [clip.fine for clip in clips if clip.fine is not None]
     if patches and len(patches) == len(clips):
         fine = pack_clips([patch.clip for patch in patches], gaps=gaps)
@@ -142,6 +148,12 @@ def clips_at(path: Path) -> int:
     """Number of clips in the shard at `path`."""
     with _open(path) as shard:
         return int(shard.get_slice("shift_m").get_shape()[0])
+
+
+def frames_in(folder: Path, city: int) -> int:
+    """Frames of each clip in a shard."""
+    with _open(shard_path(folder, city)) as shard:
+        return int(shard.get_slice("rgb").get_shape()[1])
 
 
 def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
@@ -200,7 +212,7 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     condition = Condition(
         views, image(found["color"]), plane(found["sparse_depth"]), (flags & FLAG_VALID) > 0, image(reference),
         warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
-        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders,
+        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders, effect=_effect_in(shard, f"{prefix}effect", clip),
     )  # fmt: skip
     return Clip(
         condition, image(found["rgb"]), plane(found["depth"]), (flags & FLAG_DEPTH_UNKNOWN) == 0, found["semantics"].long(), shift_m,
@@ -208,12 +220,18 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     )  # fmt: skip
 
 
+def _effect_in(shard: Any, name: str, clip: int) -> Tensor | None:
+    """The effect vector of a clip; None: it has none."""
+    found = torch.from_numpy(shard.get_slice(name)[clip]) if name in set(shard.keys()) else None
+    return found if found is not None and bool(found.any()) else None
+
+
 def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `ClassMistakes`. A mirrored clip keeps its
-    poses and intrinsics: they then describe the mirror image of the place.
+    +-8 %; the condition gets a further exposure error of +-3 %. Clips in other weather keep their colours, which are what is learned.
+    Given classes: see `ClassMistakes`. A mirrored clip keeps its poses and intrinsics: they then describe the mirror image of the place.
 
     Args:
         clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way.
@@ -224,6 +242,8 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     error = rng.uniform(0.97, 1.03)
 
     def curve(x: Tensor, extra: float) -> Tensor:
+        if clip.condition.effect is not None:
+            return x
         x = x * torch.as_tensor(gain * extra, dtype=x.dtype).view(3, 1, 1)
         x = x.clamp(1e-4, 1) ** gamma
         grey = x.mean(-3, keepdim=True)

@@ -24,7 +24,6 @@ from torch.nn import functional
 
 from mudg.base import palette, seeds
 from mudg.base.errors import UsageError
-from mudg.base.renders import RenderPlanes
 from mudg.base.types import Clip, Condition
 from mudg.core import losses, noise
 from mudg.core.align import align_depth
@@ -51,6 +50,7 @@ from mudg.models.mdm.codec import (
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
+from mudg.models.mdm.effects import Effects, Tuning
 from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles, with_detail
 from mudg.models.mdm.network import (
     ConditionPixels,
@@ -60,8 +60,8 @@ from mudg.models.mdm.network import (
     Refiner,
     TemporalAttention,
     UNet,
-    shares,
 )  # fmt: skip
+from mudg.models.mdm.stacked import Stacked, cell_means, cell_shares
 
 SKY = palette.ID["sky"]
 
@@ -76,7 +76,8 @@ class ConditionLatents:
     planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
     [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
     trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of models that use
-    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
+    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w]. effect: of models that take effect vectors, these,
+    [B,8]; None: no clip has one.
     """
 
     planes: Tensor
@@ -86,6 +87,7 @@ class ConditionLatents:
     pixels: ConditionPixels
     render: dict[Modality, Tensor] = field(default_factory=dict)
     certainty: Tensor | None = None
+    effect: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -106,11 +108,13 @@ class LossSettings:
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
+    effect_dropout     share of the clips that go without their effect vector; the small kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
+    effect_dropout: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,9 +155,6 @@ sum."""
 RENDER_GATES = 2
 """Their further outputs: how much of the render's colour and of its depth is copied."""
 
-NO_RENDER = -1.0
-"""Coverage that stands for: there is no render."""
-
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
 
@@ -181,6 +182,11 @@ class MDM(nn.Module):
         if config.finish_widths:
             (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
             self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
+        self.effects: Effects | None = None
+        if config.effects:
+            refined = [] if self.refiner is None else self.refiner.block_sides
+            self.effects = Effects(config.embed_width, self.net.block_sides, refined, config.effects)
+            self.effects.to(memory_format=torch.channels_last)
 
     @property
     def device(self) -> torch.device:
@@ -204,31 +210,31 @@ class MDM(nn.Module):
         A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
         unknown classes.
         """
-        given = _Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
+        given = Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
         color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
         self.check_size(*color.shape[-2:])
         factor = self.codec.factor
         copy: dict[Modality, Tensor] = {
-            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": _cell_shares(ids),
+            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": cell_shares(ids),
         }  # fmt: skip
         seen: dict[Modality, Tensor] = {
-            "rgb": _cell_means(torch.maximum(valid, warped), factor), "depth": _cell_means(valid, factor),
+            "rgb": cell_means(torch.maximum(valid, warped), factor), "depth": cell_means(valid, factor),
             "semantics": copy["semantics"].sum(2, keepdim=True),
         }  # fmt: skip
         far = self.codec.encode_rgb(given.backdrop)
         masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
         planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
-        pixels = self._pixels_of(given)
+        pixels, effect = self._pixels_of(given), None if self.effects is None else given.effect
         if not self.config.renders:
-            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
+            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, effect=effect)
         shown = given.renders
         render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
-        classes, certainty = _cell_shares(shown.semantics), _cell_means(shown.certainty, factor)
-        alpha = _cell_means(shown.alpha, factor)
+        classes, certainty = cell_shares(shown.semantics), cell_means(shown.certainty, factor)
+        alpha = cell_means(shown.alpha, factor)
         planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
-        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty)
+        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty, effect)
 
-    def _pixels_of(self, given: _Stacked) -> ConditionPixels:
+    def _pixels_of(self, given: Stacked) -> ConditionPixels:
         """What the refiner sees of a batch of conditions, [B*T,..]."""
         code = self.codec.linear_depth_code
         pixels = [
@@ -249,7 +255,11 @@ class MDM(nn.Module):
         Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
         """
         sizes = [x[m].shape[2] for m in MODALITIES]
-        out, gates = self.net(torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), t).split(
+        given, effect = torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), None
+        if self.effects is not None and encoded.effect is not None:
+            features = self.effects.features(encoded.effect)
+            effect = self.effects.time(features), Tuning(self.effects.net, features.repeat_interleave(given.shape[1], 0))
+        out, gates = self.net(given, t, effect).split(
             [sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2
         )
         copy_rgb, copy_depth, copy_far, copy_classes, *copy_render = gates.split(1, 2)
@@ -274,7 +284,7 @@ class MDM(nn.Module):
         With a refiner its terms are added, and their gradient reaches the denoiser.
         """
         with torch.no_grad():
-            encoded = self.encode_condition([clip.condition for clip in clips])
+            encoded = self._some_without_effect(self.encode_condition([clip.condition for clip in clips]), part, settings)
             truth = self.encode_truth(clips)
         generator = seeds.torch_generator(part.seed, part.step, "noise")
         steps = noise.stratified_steps(part.count, len(self.schedule), generator)
@@ -296,6 +306,15 @@ class MDM(nn.Module):
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)  # type: ignore[arg-type]
+
+    @staticmethod
+    def _some_without_effect(encoded: ConditionLatents, part: BatchPart, settings: LossSettings) -> ConditionLatents:
+        """The conditions, a share of them (by clip, see `BatchPart`) without their effect vector."""
+        if encoded.effect is None or not settings.effect_dropout:
+            return encoded
+        draws = [seeds.numpy_rng(part.seed, part.step, f"effect, clip {part.first + n}").random() for n in range(len(encoded.effect))]
+        kept = torch.tensor([draw >= settings.effect_dropout for draw in draws], device=encoded.effect.device)
+        return replace(encoded, effect=encoded.effect * kept[:, None])
 
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
@@ -338,7 +357,7 @@ class MDM(nn.Module):
         latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
         factor = self.codec.factor
         tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
-        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
+        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames, encoded.effect)
         return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
 
     def _finisher_terms(
@@ -351,7 +370,7 @@ class MDM(nn.Module):
         frames = stated["rgb"].shape[1]
         latents = {m: z.flatten(0, 1).detach() for m, z in stated.items()}
         with torch.no_grad():
-            small = self._made(self.refine(latents, encoded.pixels, frames))
+            small = self._made(self.refine(latents, encoded.pixels, frames, encoded.effect))
             enlarged = []
             for number, patch in patches:
                 (h, w), (height, width) = stated["rgb"].shape[-2:], patch.clip.rgb.shape[-2:]
@@ -361,7 +380,7 @@ class MDM(nn.Module):
                 clip = Made(*(getattr(small, f.name)[own] for f in fields(small)))
                 enlarged.append(clip.enlarged(size, (top, top + height), (left, left + width)))
             made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
-            given = self._pixels_of(_Stacked.of([patch.clip.condition for _, patch in patches]))
+            given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
             truth = self.pixel_truth([patch.clip for _, patch in patches])
             scale = torch.tensor([float(patch.scale) for _, patch in patches], device=made.rgb.device).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
@@ -397,15 +416,21 @@ class MDM(nn.Module):
             spans.append(slice(start, start + size))
         return spans[0], spans[1]
 
-    def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
-        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
+    def refine(
+        self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int, effect: Tensor | None = None
+    ) -> Refined:
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`); `effect` [B,8] of the clips."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
-        return self.refiner(self.codec, latents, given, frames)
+        tuning = None
+        if self.effects is not None and effect is not None:
+            tuning = Tuning(self.effects.refine, self.effects.features(effect).repeat_interleave(frames, 0))
+        return self.refiner(self.codec, latents, given, frames, tuning)
 
     def trained_part(self) -> nn.ModuleDict:
-        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner and finisher."""
-        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher}
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner, finisher and
+        effects."""
+        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher, "effects": self.effects}
         return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
@@ -458,7 +483,7 @@ class MDM(nn.Module):
                 decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
-                made = self._made(self.refine(latents, encoded.pixels, len(condition.views)))
+                made = self._made(self.refine(latents, encoded.pixels, len(condition.views), encoded.effect))
                 decoded, log_error = self._decoded(made), made.log_error
                 confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
                 if request.n_samples > 1:
@@ -481,7 +506,7 @@ class MDM(nn.Module):
         """
         if self.finisher is None or clip.log_error is None:
             raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
-        given = self._pixels_of(_Stacked.of([fine]))
+        given = self._pixels_of(Stacked.of([fine]))
         code = self.codec.linear_depth_code(clip.depth)
         made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
@@ -523,7 +548,7 @@ class MDM(nn.Module):
     def _encode_start(self, start: StartClip, device: torch.device) -> tuple[Tensor, Tensor]:
         """Latents [1,T,C,h,w] of the clip that a sample begins from, and the freedom f32[1,T,1,h,w] of their cells."""
         rgb, depth, ids = (x[None].to(device) for x in (start.rgb, start.depth, start.semantics))
-        shares = self.codec.shares_to_latent(_cell_shares(ids))
+        shares = self.codec.shares_to_latent(cell_shares(ids))
         latents = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
         freedom = functional.max_pool2d(start.freedom.to(device), self.codec.factor)[None]
         return latents, freedom
@@ -532,49 +557,3 @@ class MDM(nn.Module):
 def _expected_error(log_error: Tensor) -> Tensor:
     """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
     return log_error.clamp(-6, 1).exp() / 2
-
-
-@dataclass(frozen=True)
-class _Stacked:
-    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour as backdrop,
-    unknown classes, no render. Masks are f32."""
-
-    color: Tensor
-    depth: Tensor
-    valid: Tensor
-    warped: Tensor
-    backdrop: Tensor
-    ids: Tensor
-    backdrop_ids: Tensor
-    renders: RenderPlanes
-
-    @classmethod
-    def of(cls, batch: Sequence[Condition]) -> _Stacked:
-        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
-        renders = [_no_render(c) if c.renders is None else c.renders for c in batch]
-        return cls(
-            *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
-            torch.stack([c.valid for c in batch]).float(),
-            torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch]).float(),
-            torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch]),
-            torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
-            torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
-            RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
-        )
-
-
-def _cell_means(mask: Tensor, factor: int) -> Tensor:
-    """Mean over the pixels of each cell, f32[B,T,1,H,W] -> f32[B,T,1,h,w]."""
-    return functional.avg_pool2d(mask.flatten(0, 1), factor).unflatten(0, mask.shape[:2])
-
-
-def _cell_shares(ids: Tensor) -> Tensor:
-    """Share of each class in each cell, u8[B,T,1,H,W] -> f32[B,T,19,h,w]."""
-    return shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
-
-
-def _no_render(condition: Condition) -> RenderPlanes:
-    """The planes that stand for: there is no render."""
-    nothing = torch.zeros_like(condition.depth)
-    unknown = torch.full_like(condition.valid, palette.UNLABELLED, dtype=torch.uint8)
-    return RenderPlanes(condition.color, condition.depth, nothing + NO_RENDER, nothing, unknown)

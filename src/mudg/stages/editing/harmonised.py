@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import torch
@@ -139,6 +139,19 @@ def soft_edge(mask: NDArray[np.bool_], feather_px: int) -> Tensor:
     return torch.from_numpy(np.clip(np.asarray(inner) / (feather_px + 1), 0, 1).astype(np.float32))
 
 
+def start_clip(renders: Sequence[Observation], freedom: Sequence[Tensor], size: tuple[int, int]) -> StartClip:
+    """Renders, of whatever size, as the clip of height and width ``size`` that a sample begins from; ``freedom`` f32[H,W] of them."""
+    area = lambda x: functional.interpolate(x, size=size, mode="area")  # noqa: E731
+    picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
+    unknown = torch.full_like(renders[0].rgb[0], 255)
+    depth = [torch.full_like(unknown, FAR_M)[None] if r.depth is None else r.depth.nan_to_num(FAR_M) for r in renders]
+    ids = [unknown if r.semantics is None else r.semantics.float() for r in renders]
+    return StartClip(
+        area(torch.stack([r.rgb for r in renders])), picked(torch.stack(depth)), picked(torch.stack(ids)[:, None]).to(torch.uint8),
+        functional.adaptive_max_pool2d(torch.stack(list(freedom))[:, None].float(), size),
+    )  # fmt: skip
+
+
 def guarded(touched: Touched, render: Observation, made: Observation, other_boxes: NDArray[np.bool_]) -> Tensor:
     """Pixels bool[H,W] of `touched` whose generated class agrees with the edits: no road user came back where one was removed (but for
     those whose `other_boxes` bool[H,W] are there), and none vanished where the render has one."""
@@ -186,18 +199,9 @@ class Harmoniser:
     def _start_at(self, views: Sequence[View]) -> StartClip:
         """The renders of the window that is being made, at the size that the model works at."""
         size = views[0].camera.height, views[0].camera.width
-        area = lambda x: functional.interpolate(x, size=size, mode="area")  # noqa: E731
-        picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
         renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
-        unknown = torch.full_like(renders[0].rgb[0], 255)
-        depth = [torch.full_like(unknown, FAR_M)[None] if r.depth is None else r.depth.nan_to_num(FAR_M) for r in renders]
-        ids = [unknown if r.semantics is None else r.semantics.float() for r in renders]
         freedom = [self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched]
-        return StartClip(
-            area(torch.stack([r.rgb for r in renders])), picked(torch.stack(depth)),
-            picked(torch.stack(ids)[:, None]).to(torch.uint8),
-            functional.adaptive_max_pool2d(torch.stack(freedom)[:, None].float(), size),
-        )  # fmt: skip
+        return start_clip(renders, freedom, size)
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
         """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits do not touch."""
@@ -250,10 +254,18 @@ def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> Edit
     return replace(images, repaired=made)
 
 
+class AlongPaths(Protocol):
+    """What changes the views of a path, in order."""
+
+    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
+        """The views, changed; ``draw`` makes each without and with the edits."""
+        ...
+
+
 class RepairedViews:
     """Draws the views of paths repaired, one path at a time and in order; any other view as the renders show it."""
 
-    def __init__(self, harmoniser: Harmoniser, draw: DrawPair) -> None:
+    def __init__(self, harmoniser: AlongPaths, draw: DrawPair) -> None:
         self._harmoniser, self._draw = harmoniser, draw
         self._left: Iterator[tuple[View, Observation]] = iter(())
         self._views: tuple[View, ...] = ()

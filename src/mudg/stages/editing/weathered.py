@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -16,6 +17,7 @@ from mudg.base.weather_settings import Conditions
 from mudg.core import trajectory
 from mudg.core.weather import ShownView, drive_facts, edited_view
 from mudg.core.weather.tone import curve_of
+from mudg.data.clips.weathered import InWeather
 
 WITNESSES: Final = 8
 """Recorded views by which the light of a drive is estimated, spread over cameras and time."""
@@ -30,15 +32,12 @@ def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
     return Conditions.model_validate(asked) if asked else None
 
 
-def in_conditions(draw: Drawer, conditions: Conditions, scene: Scene) -> Drawer:
-    """Views in other weather or light.
+def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
+    """Weather for all views of a drive, with its light and ground.
 
     Args:
         draw: the views as they are, with depth and classes.
         scene: its recorded views tell the light of the drive, its path where wheels went and how fast the cameras are.
-
-    Returns:
-        What draws a view with the colours of these conditions; depth, classes and confidence stay as they are.
 
     Raises:
         InputError: views without depth or classes.
@@ -47,10 +46,19 @@ def in_conditions(draw: Drawer, conditions: Conditions, scene: Scene) -> Drawer:
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
     witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
     drive = drive_facts(witnesses, curve_of(conditions.response), _driven(scene.ego))
+    return InWeather(conditions, drive, SEED, functools.partial(trajectory.velocity, scene.ego))
+
+
+def in_weather(draw: Drawer, how: InWeather) -> Drawer:
+    """What draws a view with the colours of other weather or light; depth, classes and confidence stay as they are.
+
+    Args:
+        draw: the views as they are, with depth and classes.
+    """
 
     def drawn(view: View) -> Observation:
         seen = draw(view)
-        rgb, _ = edited_view(_shown(seen), conditions, SEED, drive, trajectory.velocity(scene.ego, view.time_s))
+        rgb, _ = edited_view(_shown(seen), how.settings, how.seed, how.drive, how.velocity_at(view.time_s))
         return replace(seen, rgb=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)).clamp(0, 1))
 
     return drawn

@@ -60,7 +60,7 @@ def score(
     pairs: list[tuple[Clip, GeneratedClip]] = []
     for city in cities:
         for number in range(clip_shards.clips_in(folder, city)):
-            frames = range(model.config.window)
+            frames = range(min(model.config.window, clip_shards.frames_in(folder, city)))
             clip = clip_shards.read_clip(folder, city, number, frames)
             clip = clip if prepare is None else prepare(clip)
             sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
