@@ -18,10 +18,13 @@ from mudg.base.palette import ID
 from mudg.core.ground import HeightMap
 from mudg.core.trajectory import at_shift
 from mudg.data.edits import parse_edits, read_edits
+from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
 from mudg.models.scene.edited import motion_of
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer.facts import UNKNOWN, PageFacts, with_ground
+from mudg.stages import edit, render
+from mudg.stages.config import EditConfig, RenderConfig
 from mudg.stages.config.view import PageConfig
 from mudg.stages.editing.carried import carry_out
 from mudg.stages.fitting.rendering import raster_of, render_view
@@ -115,6 +118,24 @@ def test_edits_are_saved_as_a_script_and_replace_only_their_own_file(toy: Toy, t
     said(desk_of(toy, place, overwrite=True), SCRIPT, save=True)
     with pytest.raises(InputError, match="no edits"):
         said(desk, "", save=True)
+
+
+@pytest.mark.slow
+def test_saved_edits_are_rendered_and_carried_out_alike(toy: Toy, tmp_path: Path) -> None:
+    place, scene = tmp_path / "edits.yaml", toy[0] / "scene"
+    said(desk_of(toy, place), SCRIPT, save=True)
+    config = RenderConfig(shifts_m=(0.0,), video=False)
+    drawn = render.run(config, scene, toy[1], tmp_path / "drawn", edits=place)
+    made = edit.run(EditConfig(), toy[1], place, tmp_path / "made", scene=scene)
+    again = render.run(config, scene, made, tmp_path / "again")
+    plain = render.run(config, scene, toy[1], tmp_path / "plain")
+
+    def images(folder: Path) -> list[torch.Tensor]:
+        seen = read_observations(folder / "front_recorded")
+        return [seen[i].rgb for i in range(len(seen))]
+
+    assert all(torch.equal(one, two) for one, two in zip(images(drawn), images(again), strict=True))
+    assert not all(torch.equal(one, two) for one, two in zip(images(drawn), images(plain), strict=True))
 
 
 def test_edits_are_never_saved_into_a_result(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
