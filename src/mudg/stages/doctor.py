@@ -7,6 +7,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Mapping
+from dataclasses import asdict
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,7 +17,9 @@ from mudg.base import memory
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
+    from mudg.base.types import Scene
     from mudg.data.scene.check import Finding
+    from mudg.stages.config.cost import SceneSize
 
 _CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av", "jinja2")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
@@ -103,26 +106,40 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     import torch
 
     from mudg import native
+    from mudg.core.raster import probe
     from mudg.data.scene import read_scene
     from mudg.stages.config import cost
 
     scene = read_scene(path)
-    first = scene.frames[0].view.camera
-    size = cost.SceneSize(len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height)
+    cores = native.default_threads()
+    size, machine = _size(scene), cost.Machine(cores, probe.speed(cores), os.cpu_count() or 1)
     devices = {"cpu": memory.free_bytes()}
     if torch.cuda.is_available():
         devices["cuda"] = torch.cuda.mem_get_info()[0]
     records: dict[str, Any] = {}
     lines = []
     for device, free in devices.items():
-        found = cost.of_presets(size, native.default_threads(), device)
+        found = cost.of_presets(size, machine, device)
         lines += cost.in_words(found, free, device)
         records[device] = {
-            name: {"seconds": dict(one.seconds), "total_s": one.total_s, "memory_bytes": one.memory_bytes,
-                   "fits": one.memory_bytes <= free if free else None}
+            name: {"seconds": one.seconds, "total_s": one.total_s, "memory_bytes": one.memory_bytes, "written_bytes": one.written_bytes,
+                   "fits": one.memory_bytes <= free if free else None, "steps": {step: asdict(of) for step, of in one.steps.items()}}
             for name, one in found.items()
         }  # fmt: skip
+    lines.append(f"speed of this machine at the moment: {machine.speed:.2f} of the one that forecasts were measured on, {cores} threads")
     return records, lines
+
+
+def _size(scene: Scene) -> SceneSize:
+    """What forecasts depend on. The first sweep stands for all."""
+    from mudg.data.scene import read_points
+    from mudg.stages.config.cost import SceneSize
+
+    first = scene.frames[0].view.camera
+    points = len(read_points(scene, scene.sweeps[0]).xyz) if scene.sweeps else 0
+    return SceneSize(
+        len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height, points, scene.source.recipe is not None
+    )
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:
