@@ -3,11 +3,12 @@
 Each step is a sum of a start and of what it does per image, pixel, Gaussian and point (`docs/presets.md` has the table). Constants are
 core-seconds on a machine of 2 virtual cores with AVX-512 and AMX; `Machine.speed` says how fast another machine is, or how much of this
 one is free: `core/raster/probe.py` measures it in a fraction of a second. On a CUDA card nothing was measured: there the memory is
-counted and the time is unknown. So is the time of a published-type model, on any device. Labelling and adapting are not counted.
+counted and the time is unknown. So is the time of a published-type model, on any device.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -34,7 +35,8 @@ FULL_VIEW_S: Final = 8.3e-6
 """The small diffusion model with renders, per view: a denoising step (bench/mdm.py, bfloat16), all else at its own size, and per pixel of
 the camera."""
 PROCESS_S: Final = 4.0
-"""Each process that makes views starts and loads the model."""
+LOAD_S: Final = 0.5
+"""Each process that makes views starts and loads the model; the chain's own process only loads it."""
 RENDER_S: Final = 1.6e-6
 SCORED_VIEW_S: Final = 0.06
 SCORE_S: Final = 1.45e-6
@@ -43,22 +45,37 @@ REPORT_S: Final = 0.5e-6
 FUSE_S: Final = 0.02
 FUSE_PIXEL_S: Final = 1.0e-6
 """Per recorded image and its pixels."""
+LABEL_S: Final = 0.4
+LABEL_PIXEL_S: Final = 4.4e-6
+"""Labels and dense depth of a recorded image, by the shipped labeller."""
+LABEL_PROCESS_FRAMES: Final = 8
+"""Fewer images than this are not worth a process (stages/annotate.py)."""
+SHORT_GAUSSIANS: Final = 40_000
+"""Gaussians of the short fits that lessons of a log are made with (stages/fitting/short.py)."""
+LESSON_S: Final = 2.0
+TRAINED_FRAME_S: Final = 0.12
+"""Of adapt: a lesson's photographs carried and written, and a frame of a training step, forward and backward."""
 VIEWER_S: Final = 0.4
 START_S: Final = 0.3
 FIT_START_S: Final = 1.5
 """Any step, before it computes; a fit also chooses its first Gaussians and reads its views."""
 
 START_GAUSSIANS: Final = 0.6
+START_POINTS: Final = 0.15
 GROWN: Final = 1.96
+GROWTH_STEPS: Final = 120
+LONG_FIT: Final = 200
 PIXELS_PER_GAUSSIAN: Final = 3
-"""Gaussians at the start, per recorded pixel; how many times as many a short fit ends with, those of objects included (6 images of 120x80
-led to 71,000); and a long fit ends with one per so many recorded pixels, if that is more. Never more than the limits of the settings."""
+"""Gaussians at the start, per recorded pixel and at most per measured point; how many times as many a short fit ends with, those of objects
+included (6 images of 120x80 led to 71,000), after how many iterations; and a fit of more iterations than LONG_FIT ends with one per so many
+recorded pixels, if that is more. Never more than the limits of the settings."""
 PROGRAM_BYTES: Final = 360_000_000
 """Python, torch and the native library: resident after ingest."""
 KEPT_BYTES: Final = 180_000_000
 """What the chain's process does not give back after the first fit."""
-KEPT_MODEL_BYTES: Final = 400_000_000
-"""Likewise, where the chain's process made the views itself: after that."""
+KEPT_MODEL_BYTES: Final = 150_000_000
+KEPT_PIXEL_BYTES: Final = 3_400
+"""Likewise, where the chain's process made the views itself: after that, and per pixel of the camera."""
 COPIES: Final = 4.85
 """Numbers held per parameter: itself, two moments of Adam, and 1.85 for gradient and rasteriser (bench/README.md)."""
 RECORDED_BYTES: Final = 7
@@ -70,8 +87,15 @@ STEP_PIXEL_BYTES: Final = 600
 """Per pixel of the view of a step: images, gradients and what losses keep."""
 RENDER_PIXEL_BYTES: Final = 2000
 """Per pixel of a view, while pictures are rendered or scored."""
+LABEL_BYTES: Final = 60_000_000
+LABEL_PIXEL_BYTES: Final = 400
+"""The labeller, per process and per pixel of an image."""
+TRAINING_BYTES: Final = 900_000_000
+"""Adapt: the small diffusion model while it is trained."""
 POINT_BYTES: Final = 60
 """Per LiDAR point, while points are fused."""
+OWN_PROCESS_BYTES: Final = 300_000_000
+"""Of that, what the chain's own process has already."""
 MODEL_BYTES: Final = 570_000_000
 CLIP_PIXEL_BYTES: Final = 6_800
 """The small diffusion model while it samples: per process, and for each pixel of the camera, to whose size the finisher brings a window."""
@@ -79,13 +103,18 @@ PUBLISHED_BYTES: Final = {"cpu": 19_000_000_000, "cuda": 9_000_000_000}
 """The published one at 576x1024: on the CPU in float32 with all work at once, on CUDA in bfloat16 with the work cut to 10 GB (counted, not
 measured: docs/published.md)."""
 
-COLORED_POINT_FILE: Final = 1.5
-"""Bytes of the fused clouds, per recorded image and point of a sweep; a camera of 60 degrees sees a sixth of them."""
+COLORED_POINT_FILE: Final = 8.5
+"""Bytes of the fused clouds, per recorded image and point of a sweep that it sees."""
 GAUSSIAN_FILE: Final = 132
 """Per Gaussian of a fit, with its semantics; harmonics of degree 0."""
 FIT_FILE: Final = 500_000
 VIEW_FILE: Final = 9.7
 """Per pixel of a written view: colour losslessly, depth, classes, confidence."""
+LABEL_FILE: Final = 16
+SWEEP_FILE: Final = 22
+"""Per pixel of a labelled image, and per point of a sweep: a labelled scene holds images and sweeps again."""
+ADAPTED_FILE: Final = 20_000_000
+"""The adapted model."""
 LINE_FILE: Final = 850_000
 """Per generated trajectory: the overview picture."""
 SCORE_FILE: Final = 19.7
@@ -102,6 +131,7 @@ class SceneSize:
     Args:
         images: that are fitted. path_images: of the camera that is shifted, one per frame. width, height: of an image, pixels.
         points: LiDAR points of a sweep (0 = not counted). exact: the truth of shifted views is known (generated cities).
+        seen: share of a sweep's points that lie in an image. labelled: semantic labels are there. adapts: the diffusion model can be adapted to the log.
     """
 
     images: int
@@ -110,6 +140,9 @@ class SceneSize:
     height: int
     points: int = 0
     exact: bool = True
+    seen: float = 1 / 6
+    labelled: bool = True
+    adapts: bool = False
 
     @property
     def pixels(self) -> int:
@@ -173,13 +206,14 @@ def estimate(config: RunConfig, size: SceneSize, machine: Machine, device: str =
     """Forecast ``mudg run SCENE`` with a configuration; ``device``: ``cpu`` or ``cuda``."""
     processes = _processes(config, machine) if device == "cpu" else 1
     written, memory = _written(config, size), _memory(config, size, processes, device)
-    if device != "cpu":
-        return Estimate({name: StepCost(None, None, memory[name], written[name]) for name in written})
     work = _work(config, size, processes)
+    if device != "cpu":
+        return Estimate({name: StepCost(None, None, memory[name], written[name]) for name in work})
+    used = {"synthesize": processes, "annotate": _labelling(config, size, machine), "adapt": min(machine.cores, _lessons(config))}
     per_core = 1 - SHARED + SHARED / machine.cores
     steps = {}
     for name, core_s in work.items():
-        share = 1 / min(processes, machine.cores) if name == "synthesize" else per_core
+        share = 1 / min(used[name], machine.cores) if name in used else per_core
         processor_s = None if core_s is None else (core_s + START_S) / machine.speed
         seconds = None if core_s is None else (core_s * share + START_S) / machine.speed
         steps[name] = StepCost(seconds, processor_s, memory[name], written[name])
@@ -197,12 +231,14 @@ def _work(config: RunConfig, size: SceneSize, processes: int) -> dict[str, float
     beside = share * virtual.beside * step_s + share * VIRTUAL_PIXEL_S * fit_pixels
     made, rendered = _views(config, size)
     per_view = CLIP_STEP_S * config.synthesize.steps + CLIP_S + FULL_VIEW_S * pixels
-    synthesized = PROCESS_S * processes + made * config.synthesize.samples * per_view
+    synthesized = (PROCESS_S * processes if processes > 1 else LOAD_S) + made * config.synthesize.samples * per_view
     render_s = rendered * RENDER_S * pixels
     scored = _scored(config, size)
     return {
+        **({} if size.labelled else {"annotate": size.images * (LABEL_S + LABEL_PIXEL_S * pixels)}),
         "fuse": size.images * (FUSE_S + FUSE_PIXEL_S * pixels),
         "fit without diffusion": FIT_START_S + fit.iterations * step_s,
+        **({"adapt": _adapting(config, size)} if _adapts(config, size) else {}),
         "synthesize": None if _published(config) else synthesized,
         "fit with diffusion": FIT_START_S + further * (step_s + beside),
         "render without diffusion": render_s,
@@ -213,6 +249,30 @@ def _work(config: RunConfig, size: SceneSize, processes: int) -> dict[str, float
     }
 
 
+def _adapts(config: RunConfig, size: SceneSize) -> bool:
+    return size.adapts and config.adaptation != "off" and not _published(config)
+
+
+def _lessons(config: RunConfig) -> int:
+    """Short fits that adapt makes: two with gaps, one per lateral shift."""
+    return 2 * config.adapt.gaps + len(config.adapt.shifts_m)
+
+
+def _adapting(config: RunConfig, size: SceneSize) -> float:
+    """Core-seconds of adapt: every lesson is fitted, its clips are made, the model is trained, and scored before and after."""
+    adapt = config.adapt
+    fitted = FIT_START_S + LESSON_S + PROCESS_S + adapt.fit_iterations * GAUSSIAN_STEP_S * SHORT_GAUSSIANS
+    clips = size.path_images * (1 * adapt.gaps + len(adapt.shifts_m))
+    made = clips * (CLIP_STEP_S + CLIP_S + FULL_VIEW_S * size.pixels)
+    return _lessons(config) * fitted + made + adapt.steps * adapt.batch_frames * TRAINED_FRAME_S
+
+
+def _labelling(config: RunConfig, size: SceneSize, machine: Machine) -> int:
+    """Processes that label images."""
+    most = config.annotate.processes or machine.processors or machine.cores
+    return max(1, min(most, size.images // LABEL_PROCESS_FRAMES))
+
+
 def _memory(config: RunConfig, size: SceneSize, processes: int, device: str) -> dict[str, int]:
     """Bytes per step at the worst moment. A step on a card is counted with what lies there alone."""
     columns = _columns(config)
@@ -221,10 +281,15 @@ def _memory(config: RunConfig, size: SceneSize, processes: int, device: str) -> 
     for name, virtual in (("fit without diffusion", 0), ("fit with diffusion", _views(config, size)[0])):
         views = min((RECORDED_BYTES * size.images + VIRTUAL_BYTES * virtual) * fit_pixels, VIEWS_BYTES) if device == "cpu" else 0
         kept[name] = 4 * COPIES * columns * gaussians + views + STEP_PIXEL_BYTES * fit_pixels
-    later = 2 * KEPT_BYTES + (KEPT_MODEL_BYTES if processes == 1 and device == "cpu" else 0)
+    later = 2 * KEPT_BYTES + (KEPT_MODEL_BYTES + KEPT_PIXEL_BYTES * size.pixels if processes == 1 and device == "cpu" else 0)
     scene = 8 * columns * gaussians + RENDER_PIXEL_BYTES * size.pixels
     model = PUBLISHED_BYTES[device] if _published(config) else processes * (MODEL_BYTES + CLIP_PIXEL_BYTES * size.pixels)
+    model -= OWN_PROCESS_BYTES if processes == 1 and device == "cpu" and not _published(config) else 0
+    labelling = processes * (LABEL_BYTES + LABEL_PIXEL_BYTES * size.pixels)
+    adapting = processes * MODEL_BYTES + TRAINING_BYTES
     steps = {
+        **({} if size.labelled else {"annotate": labelling}),
+        **({"adapt": adapting + KEPT_BYTES} if _adapts(config, size) else {}),
         "fuse": POINT_BYTES * size.points * max(1, size.path_images), "fit without diffusion": kept["fit without diffusion"] + KEPT_BYTES,
         "synthesize": model + KEPT_BYTES, "fit with diffusion": kept["fit with diffusion"] + later,
         "render without diffusion": scene + later, "render with diffusion": scene + later,
@@ -241,7 +306,9 @@ def _written(config: RunConfig, size: SceneSize) -> dict[str, int]:
     render = VIEW_FILE * rendered * pixels
     scored = rendered if size.exact else size.path_images
     steps = {
-        "fuse": 250_000 + COLORED_POINT_FILE * size.points * size.images, "fit without diffusion": fit,
+        **({} if size.labelled else {"annotate": LABEL_FILE * size.images * pixels + SWEEP_FILE * size.points * size.path_images}),
+        **({"adapt": ADAPTED_FILE} if _adapts(config, size) else {}),
+        "fuse": 250_000 + COLORED_POINT_FILE * size.seen * size.points * size.images, "fit without diffusion": fit,
         "synthesize": LINE_FILE * len(config.synthesize.shifts_m) + VIEW_FILE * made * pixels, "fit with diffusion": fit,
         "render without diffusion": render, "render with diffusion": render, "score": SCORE_FILE * scored * pixels,
         "viewer": VIEWER_GAUSSIAN_FILE * gaussians, "report": min(REPORT_LARGEST, REPORT_FILE * rendered * pixels),
@@ -276,8 +343,11 @@ def _columns(config: RunConfig) -> int:
 
 def _gaussians(config: RunConfig, size: SceneSize) -> int:
     recorded = size.images * size.pixels
-    start = min(config.fit.start.gaussians, START_GAUSSIANS * recorded)
-    return min(config.fit.densify.max_gaussians, round(max(GROWN * start, recorded / PIXELS_PER_GAUSSIAN)))
+    measured = START_POINTS * size.points * size.path_images or math.inf
+    start = min(config.fit.start.gaussians, START_GAUSSIANS * recorded, measured)
+    grown = start * (1 + (GROWN - 1) * min(1.0, config.fit.iterations / GROWTH_STEPS))
+    long = recorded / PIXELS_PER_GAUSSIAN if config.fit.iterations > LONG_FIT else 0
+    return min(config.fit.densify.max_gaussians, round(max(grown, long)))
 
 
 def _fit_pixels(config: RunConfig, size: SceneSize) -> int:
@@ -290,9 +360,11 @@ def of_presets(size: SceneSize, machine: Machine, device: str = "cpu") -> dict[P
     return {name: estimate(run_preset(name), size, machine, device) for name in PRESETS}
 
 
-def in_words(found: Mapping[PresetName, Estimate], free_bytes: int, device: str = "cpu") -> list[str]:
-    """A line per preset: time, memory, disk, and whether the memory fits into what is free (0: unknown); then a table of the steps."""
-    lines = [f"forecasts for mudg run on this scene ({device}, without annotate and adapt):"]
+def in_words(
+    found: Mapping[PresetName, Estimate], free_bytes: int, device: str = "cpu", free_disk_bytes: int = 0
+) -> list[str]:
+    """A line per preset: time, memory, disk; then which presets fit into what is free (0: unknown), and a table of the steps."""
+    lines = [f"forecasts for mudg run on this scene ({device}):"]
     for name, one in found.items():
         unknown = [step for step, value in one.seconds.items() if value is None]
         known_s = sum(value for value in one.seconds.values() if value is not None)
@@ -301,7 +373,11 @@ def in_words(found: Mapping[PresetName, Estimate], free_bytes: int, device: str 
             time = f"{time} and {', '.join(unknown)} (not measured)"
         fits = "" if not free_bytes else "fits" if one.memory_bytes <= free_bytes else "does NOT fit"
         free = f", {fits} into the {free_bytes / 1e9:.1f} GB that are free" if fits else ""
-        lines.append(f"  --preset {name:<8} {time}; about {one.memory_bytes / 1e9:.1f} GB{free}; {_size(one.written_bytes)} on disk")
+        disk = " (NOT free here)" if free_disk_bytes and one.written_bytes > free_disk_bytes else ""
+        lines.append(f"  --preset {name:<8} {time}; about {one.memory_bytes / 1e9:.1f} GB{free}; {_size(one.written_bytes)} on disk{disk}")
+    if free_bytes:
+        able = [name for name, one in found.items() if fits_machine(one, free_bytes, free_disk_bytes)]
+        lines.append(f"  memory and disk of this machine suffice for: {', '.join(able) or 'none of the presets (smaller images, fewer frames)'}")
     lines.append(f"  {'per step: time, memory, disk':<30}" + "".join(f"{name:>26}" for name in found))
     for step in next(iter(found.values())).steps:
         cells = [
@@ -310,6 +386,12 @@ def in_words(found: Mapping[PresetName, Estimate], free_bytes: int, device: str 
         ]
         lines.append(f"    {step:<28}" + "".join(f"{cell:>26}" for cell in cells))
     return lines
+
+
+def fits_machine(one: Estimate, free_bytes: int, free_disk_bytes: int) -> bool:
+    """Whether memory and disk that are free suffice; 0 = not known, and then not asked."""
+    memory = not free_bytes or one.memory_bytes <= free_bytes
+    return memory and (not free_disk_bytes or one.written_bytes <= free_disk_bytes)
 
 
 def _size(count: int) -> str:
