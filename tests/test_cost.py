@@ -34,8 +34,8 @@ def settings(preset: cost.PresetName, iterations: int = 0, shifts_m: tuple[float
 
 
 class Ledger(NamedTuple):
-    """A run that was measured: `tests/ledgers/*.json`, from the ``run.json`` of each. Per step what was noted: ``seconds`` on an undisturbed
-    machine, ``processor_s``, ``memory_mb``, ``written_mb``."""
+    """A run that was measured: `tests/ledgers/*.json`, from the ``run.json`` of each. Per step what was noted: ``seconds`` on an
+    undisturbed machine, ``processor_s``, ``memory_mb``, ``written_mb``."""
 
     about: str
     config: RunConfig

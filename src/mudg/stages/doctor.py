@@ -126,7 +126,8 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
         lines += cost.in_words(found, free, device, disk)
         records[device] = {
             name: {"seconds": one.seconds, "total_s": one.total_s, "memory_bytes": one.memory_bytes, "written_bytes": one.written_bytes,
-                   "fits": cost.fits_machine(one, free, disk) if free else None, "steps": {step: asdict(of) for step, of in one.steps.items()}}
+                   "fits": cost.fits_machine(one, free, disk) if free else None,
+                   "steps": {step: asdict(of) for step, of in one.steps.items()}}
             for name, one in found.items()
         }  # fmt: skip
     lines.append(

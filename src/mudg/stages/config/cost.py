@@ -38,13 +38,14 @@ PROCESS_S: Final = 4.0
 LOAD_S: Final = 0.5
 """Each process that makes views starts and loads the model; the chain's own process only loads it."""
 RENDER_S: Final = 1.6e-6
-SCORED_VIEW_S: Final = 0.06
+SCORED_VIEW_S: Final = 0.075
 SCORE_S: Final = 1.45e-6
 REPORT_S: Final = 0.5e-6
 """Per pixel of a view, and per view: `mudg demo --fast` and `mudg demo`."""
 FUSE_S: Final = 0.02
 FUSE_PIXEL_S: Final = 1.0e-6
-"""Per recorded image and its pixels."""
+MATCH_S: Final = 0.045
+"""Per recorded image and its pixels; where there are several cameras, whose colours are compared, also per image."""
 LABEL_S: Final = 0.4
 LABEL_PIXEL_S: Final = 4.4e-6
 """Labels and dense depth of a recorded image, by the shipped labeller."""
@@ -67,8 +68,8 @@ GROWTH_STEPS: Final = 120
 LONG_FIT: Final = 200
 PIXELS_PER_GAUSSIAN: Final = 3
 """Gaussians at the start, per recorded pixel and at most per measured point; how many times as many a short fit ends with, those of objects
-included (6 images of 120x80 led to 71,000), after how many iterations; and a fit of more iterations than LONG_FIT ends with one per so many
-recorded pixels, if that is more. Never more than the limits of the settings."""
+included (6 images of 120x80 led to 71,000), after how many iterations; and a fit of more iterations than LONG_FIT ends with one
+per so many recorded pixels, if that is more. Never more than the limits of the settings."""
 PROGRAM_BYTES: Final = 360_000_000
 """Python, torch and the native library: resident after ingest."""
 KEPT_BYTES: Final = 180_000_000
@@ -236,7 +237,7 @@ def _work(config: RunConfig, size: SceneSize, processes: int) -> dict[str, float
     scored = _scored(config, size)
     return {
         **({} if size.labelled else {"annotate": size.images * (LABEL_S + LABEL_PIXEL_S * pixels)}),
-        "fuse": size.images * (FUSE_S + FUSE_PIXEL_S * pixels),
+        "fuse": size.images * (FUSE_S + FUSE_PIXEL_S * pixels + (MATCH_S if size.images > size.path_images else 0)),
         "fit without diffusion": FIT_START_S + fit.iterations * step_s,
         **({"adapt": _adapting(config, size)} if _adapts(config, size) else {}),
         "synthesize": None if _published(config) else synthesized,
@@ -377,7 +378,7 @@ def in_words(
         lines.append(f"  --preset {name:<8} {time}; about {one.memory_bytes / 1e9:.1f} GB{free}; {_size(one.written_bytes)} on disk{disk}")
     if free_bytes:
         able = [name for name, one in found.items() if fits_machine(one, free_bytes, free_disk_bytes)]
-        lines.append(f"  memory and disk of this machine suffice for: {', '.join(able) or 'none of the presets (smaller images, fewer frames)'}")
+        lines.append(f"  memory and disk of this machine suffice for: {', '.join(able) or 'none (smaller images, fewer frames)'}")
     lines.append(f"  {'per step: time, memory, disk':<30}" + "".join(f"{name:>26}" for name in found))
     for step in next(iter(found.values())).steps:
         cells = [
