@@ -132,7 +132,8 @@ class SceneSize:
     Args:
         images: that are fitted. path_images: of the camera that is shifted, one per frame. width, height: of an image, pixels.
         points: LiDAR points of a sweep (0 = not counted). exact: the truth of shifted views is known (generated cities).
-        seen: share of a sweep's points that lie in an image. labelled: semantic labels are there. adapts: the diffusion model can be adapted to the log.
+        seen: share of a sweep's points that lie in an image. labelled: semantic labels are there.
+        adapts: the diffusion model can be adapted to the log.
     """
 
     images: int
