@@ -49,12 +49,14 @@ MATCH_S: Final = 0.045
 LABEL_S: Final = 0.4
 LABEL_PIXEL_S: Final = 4.4e-6
 """Labels and dense depth of a recorded image, by the shipped labeller."""
+LABELLER_S: Final = 3.0
+"""Each of several processes that label starts and loads the network."""
 LABEL_PROCESS_FRAMES: Final = 8
 """Fewer images than this are not worth a process (stages/annotate.py)."""
 SHORT_GAUSSIANS: Final = 40_000
 """Gaussians of the short fits that lessons of a log are made with (stages/fitting/short.py)."""
 LESSON_S: Final = 2.0
-TRAINED_FRAME_S: Final = 0.12
+TRAINED_FRAME_S: Final = 0.25
 """Of adapt: a lesson's photographs carried and written, and a frame of a training step, forward and backward."""
 VIEWER_S: Final = 0.4
 START_S: Final = 0.3
@@ -62,14 +64,16 @@ FIT_START_S: Final = 1.5
 """Any step, before it computes; a fit also chooses its first Gaussians and reads its views."""
 
 START_GAUSSIANS: Final = 0.6
-START_POINTS: Final = 0.15
+START_POINTS: Final = 0.4
+NEW_POINTS: Final = 0.4
 GROWN: Final = 1.96
 GROWTH_STEPS: Final = 120
 LONG_FIT: Final = 200
 PIXELS_PER_GAUSSIAN: Final = 3
-"""Gaussians at the start, per recorded pixel and at most per measured point; how many times as many a short fit ends with, those of objects
-included (6 images of 120x80 led to 71,000), after how many iterations; and a fit of more iterations than LONG_FIT ends with one
-per so many recorded pixels, if that is more. Never more than the limits of the settings."""
+"""Gaussians at the start, per recorded pixel, and at most per point of a sweep, times a power of the frames, since later
+sweeps measure much the same (6 frames of a KITTI drive started 26,000, 16 started 37,000); how many times as many a short
+fit ends with, those of objects included (6 images of 120x80 led to 71,000), after how many iterations; and a fit of more iterations than
+LONG_FIT ends with one per so many recorded pixels, if that is more. Never more than the limits of the settings."""
 PROGRAM_BYTES: Final = 360_000_000
 """Python, torch and the native library: resident after ingest."""
 KEPT_BYTES: Final = 180_000_000
@@ -89,10 +93,12 @@ STEP_PIXEL_BYTES: Final = 600
 RENDER_PIXEL_BYTES: Final = 2000
 """Per pixel of a view, while pictures are rendered or scored."""
 LABEL_BYTES: Final = 60_000_000
+LABEL_PROCESS_BYTES: Final = 290_000_000
 LABEL_PIXEL_BYTES: Final = 400
-"""The labeller, per process and per pixel of an image."""
-TRAINING_BYTES: Final = 900_000_000
-"""Adapt: the small diffusion model while it is trained."""
+"""The labeller, per process and per pixel of an image; where there are several processes, each is a program of its own, too."""
+TRAINING_BYTES: Final = 1_000_000_000
+KEPT_TRAINING_BYTES: Final = 600_000_000
+"""Adapt: the small diffusion model while it is trained, and what the chain's process does not give back after that."""
 POINT_BYTES: Final = 60
 """Per LiDAR point, while points are fused."""
 OWN_PROCESS_BYTES: Final = 300_000_000
@@ -114,7 +120,7 @@ VIEW_FILE: Final = 9.7
 LABEL_FILE: Final = 16
 SWEEP_FILE: Final = 22
 """Per pixel of a labelled image, and per point of a sweep: a labelled scene holds images and sweeps again."""
-ADAPTED_FILE: Final = 20_000_000
+ADAPTED_FILE: Final = 29_000_000
 """The adapted model."""
 LINE_FILE: Final = 850_000
 """Per generated trajectory: the overview picture."""
@@ -122,6 +128,7 @@ SCORE_FILE: Final = 19.7
 """Per pixel of a scored view: its truth, and the nearest fill."""
 VIEWER_GAUSSIAN_FILE: Final = 26
 REPORT_FILE: Final = 1.1
+REPORT_ADAPTED_FILE: Final = 1_000_000
 REPORT_LARGEST: Final = 22_000_000
 
 
@@ -207,11 +214,12 @@ class Estimate:
 def estimate(config: RunConfig, size: SceneSize, machine: Machine, device: str = "cpu") -> Estimate:
     """Forecast ``mudg run SCENE`` with a configuration; ``device``: ``cpu`` or ``cuda``."""
     processes = _processes(config, machine) if device == "cpu" else 1
-    written, memory = _written(config, size), _memory(config, size, processes, device)
-    work = _work(config, size, processes)
+    labellers = _labelling(config, size, machine)
+    written, memory = _written(config, size), _memory(config, size, (processes, labellers), device)
+    work = _work(config, size, (processes, labellers))
     if device != "cpu":
         return Estimate({name: StepCost(None, None, memory[name], written[name]) for name in work})
-    used = {"synthesize": processes, "annotate": _labelling(config, size, machine), "adapt": min(machine.cores, _lessons(config))}
+    used = {"synthesize": processes, "annotate": labellers, "adapt": min(machine.cores, _lessons(config))}
     per_core = 1 - SHARED + SHARED / machine.cores
     steps = {}
     for name, core_s in work.items():
@@ -222,8 +230,11 @@ def estimate(config: RunConfig, size: SceneSize, machine: Machine, device: str =
     return Estimate(steps)
 
 
-def _work(config: RunConfig, size: SceneSize, processes: int) -> dict[str, float | None]:
-    """Core-seconds per step, on the machine where the constants were measured; None: not measured."""
+def _work(config: RunConfig, size: SceneSize, workers: tuple[int, int]) -> dict[str, float | None]:
+    """Core-seconds per step, on the machine where the constants were measured; None: not measured. workers: processes of synthesize and
+    of annotate."""
+    processes, labellers = workers
+    labelling = LABELLER_S * labellers if labellers > 1 else 0.0
     fit, virtual, pixels = config.fit, config.fit.virtual, size.pixels
     gaussians, fit_pixels = _gaussians(config, size), _fit_pixels(config, size)
     classes = (1 + 1 / (3 * fit.loss.semantic_every)) / (1 + 1 / 9)
@@ -237,7 +248,7 @@ def _work(config: RunConfig, size: SceneSize, processes: int) -> dict[str, float
     render_s = rendered * RENDER_S * pixels
     scored = _scored(config, size)
     return {
-        **({} if size.labelled else {"annotate": size.images * (LABEL_S + LABEL_PIXEL_S * pixels)}),
+        **({} if size.labelled else {"annotate": labelling + size.images * (LABEL_S + LABEL_PIXEL_S * pixels)}),
         "fuse": size.images * (FUSE_S + FUSE_PIXEL_S * pixels + (MATCH_S if size.images > size.path_images else 0)),
         "fit without diffusion": FIT_START_S + fit.iterations * step_s,
         **({"adapt": _adapting(config, size)} if _adapts(config, size) else {}),
@@ -275,25 +286,28 @@ def _labelling(config: RunConfig, size: SceneSize, machine: Machine) -> int:
     return max(1, min(most, size.images // LABEL_PROCESS_FRAMES))
 
 
-def _memory(config: RunConfig, size: SceneSize, processes: int, device: str) -> dict[str, int]:
+def _memory(config: RunConfig, size: SceneSize, workers: tuple[int, int], device: str) -> dict[str, int]:
     """Bytes per step at the worst moment. A step on a card is counted with what lies there alone."""
+    processes, labellers = workers
     columns = _columns(config)
     gaussians, fit_pixels = _gaussians(config, size), _fit_pixels(config, size)
     kept = {}
     for name, virtual in (("fit without diffusion", 0), ("fit with diffusion", _views(config, size)[0])):
         views = min((RECORDED_BYTES * size.images + VIRTUAL_BYTES * virtual) * fit_pixels, VIEWS_BYTES) if device == "cpu" else 0
         kept[name] = 4 * COPIES * columns * gaussians + views + STEP_PIXEL_BYTES * fit_pixels
-    later = 2 * KEPT_BYTES + (KEPT_MODEL_BYTES + KEPT_PIXEL_BYTES * size.pixels if processes == 1 and device == "cpu" else 0)
+    trained = KEPT_TRAINING_BYTES if _adapts(config, size) and device == "cpu" else 0
+    later = 2 * KEPT_BYTES + trained + (KEPT_MODEL_BYTES + KEPT_PIXEL_BYTES * size.pixels if processes == 1 and device == "cpu" else 0)
     scene = 8 * columns * gaussians + RENDER_PIXEL_BYTES * size.pixels
     model = PUBLISHED_BYTES[device] if _published(config) else processes * (MODEL_BYTES + CLIP_PIXEL_BYTES * size.pixels)
     model -= OWN_PROCESS_BYTES if processes == 1 and device == "cpu" and not _published(config) else 0
-    labelling = processes * (LABEL_BYTES + LABEL_PIXEL_BYTES * size.pixels)
+    own = LABEL_PROCESS_BYTES if labellers > 1 else 0
+    labelling = labellers * (LABEL_BYTES + own + LABEL_PIXEL_BYTES * size.pixels)
     adapting = processes * MODEL_BYTES + TRAINING_BYTES
     steps = {
         **({} if size.labelled else {"annotate": labelling}),
         **({"adapt": adapting + KEPT_BYTES} if _adapts(config, size) else {}),
         "fuse": POINT_BYTES * size.points * max(1, size.path_images), "fit without diffusion": kept["fit without diffusion"] + KEPT_BYTES,
-        "synthesize": model + KEPT_BYTES, "fit with diffusion": kept["fit with diffusion"] + later,
+        "synthesize": model + KEPT_BYTES + trained, "fit with diffusion": kept["fit with diffusion"] + later,
         "render without diffusion": scene + later, "render with diffusion": scene + later,
         **dict.fromkeys(("score", "viewer", "report"), scene + later - KEPT_BYTES / 2),
     }  # fmt: skip
@@ -313,7 +327,7 @@ def _written(config: RunConfig, size: SceneSize) -> dict[str, int]:
         "fuse": 250_000 + COLORED_POINT_FILE * size.seen * size.points * size.images, "fit without diffusion": fit,
         "synthesize": LINE_FILE * len(config.synthesize.shifts_m) + VIEW_FILE * made * pixels, "fit with diffusion": fit,
         "render without diffusion": render, "render with diffusion": render, "score": SCORE_FILE * scored * pixels,
-        "viewer": VIEWER_GAUSSIAN_FILE * gaussians, "report": min(REPORT_LARGEST, REPORT_FILE * rendered * pixels),
+        "viewer": VIEWER_GAUSSIAN_FILE * gaussians, "report": min(REPORT_LARGEST, REPORT_FILE * rendered * pixels) + REPORT_ADAPTED_FILE * _adapts(config, size),
     }  # fmt: skip
     return {name: round(value) for name, value in steps.items()}
 
@@ -345,7 +359,7 @@ def _columns(config: RunConfig) -> int:
 
 def _gaussians(config: RunConfig, size: SceneSize) -> int:
     recorded = size.images * size.pixels
-    measured = START_POINTS * size.points * size.path_images or math.inf
+    measured = START_POINTS * size.points * size.path_images**NEW_POINTS or math.inf
     start = min(config.fit.start.gaussians, START_GAUSSIANS * recorded, measured)
     grown = start * (1 + (GROWN - 1) * min(1.0, config.fit.iterations / GROWTH_STEPS))
     long = recorded / PIXELS_PER_GAUSSIAN if config.fit.iterations > LONG_FIT else 0
