@@ -42,10 +42,10 @@ SCORED_VIEW_S: Final = 0.075
 SCORE_S: Final = 1.45e-6
 REPORT_S: Final = 0.5e-6
 """Per pixel of a view, and per view: `mudg demo --fast` and `mudg demo`."""
-FUSE_S: Final = 0.02
-FUSE_PIXEL_S: Final = 1.0e-6
-MATCH_S: Final = 0.045
-"""Per recorded image and its pixels; where there are several cameras, whose colours are compared, also per image."""
+FUSE_S: Final = 0.012
+FUSE_POINT_S: Final = 2.0e-7
+MATCH_S: Final = 0.13
+"""Per recorded image, and per point of its sweep; where there are several cameras, whose colours are compared, more per image."""
 LABEL_S: Final = 0.4
 LABEL_PIXEL_S: Final = 4.4e-6
 """Labels and dense depth of a recorded image, by the shipped labeller."""
@@ -125,11 +125,14 @@ ADAPTED_FILE: Final = 29_000_000
 LINE_FILE: Final = 850_000
 """Per generated trajectory: the overview picture."""
 SCORE_FILE: Final = 19.7
-"""Per pixel of a scored view: its truth, and the nearest fill."""
+LOG_SCORE_FILE: Final = 30
+"""Per pixel of a scored view: its truth, and the nearest fill; of recorded logs, whose images are those of a camera, per recorded one."""
 VIEWER_GAUSSIAN_FILE: Final = 26
 REPORT_FILE: Final = 1.1
 REPORT_ADAPTED_FILE: Final = 1_000_000
-REPORT_LARGEST: Final = 22_000_000
+REPORT_LARGEST: Final = 6_600_000
+PANEL_PX: Final = 320
+"""Of the page: per pixel of a view, at most so many pixels wide; where a log was adapted to; and videos, which share what there is."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +252,7 @@ def _work(config: RunConfig, size: SceneSize, workers: tuple[int, int]) -> dict[
     scored = _scored(config, size)
     return {
         **({} if size.labelled else {"annotate": labelling + size.images * (LABEL_S + LABEL_PIXEL_S * pixels)}),
-        "fuse": size.images * (FUSE_S + FUSE_PIXEL_S * pixels + (MATCH_S if size.images > size.path_images else 0)),
+        "fuse": size.images * (FUSE_S + FUSE_POINT_S * size.points + (MATCH_S if size.images > size.path_images else 0)),
         "fit without diffusion": FIT_START_S + fit.iterations * step_s,
         **({"adapt": _adapting(config, size)} if _adapts(config, size) else {}),
         "synthesize": None if _published(config) else synthesized,
@@ -321,13 +324,16 @@ def _written(config: RunConfig, size: SceneSize) -> dict[str, int]:
     fit = FIT_FILE + gaussians * (GAUSSIAN_FILE + 4 * 3 * ((config.fit.sh_degree + 1) ** 2 - 1))
     render = VIEW_FILE * rendered * pixels
     scored = rendered if size.exact else size.path_images
+    score = (SCORE_FILE if size.exact else LOG_SCORE_FILE) * scored * pixels
+    panel = pixels * min(1.0, PANEL_PX / size.width) ** 2
+    report = min(REPORT_LARGEST, REPORT_FILE * rendered * panel) + REPORT_ADAPTED_FILE * _adapts(config, size)
     steps = {
         **({} if size.labelled else {"annotate": LABEL_FILE * size.images * pixels + SWEEP_FILE * size.points * size.path_images}),
         **({"adapt": ADAPTED_FILE} if _adapts(config, size) else {}),
         "fuse": 250_000 + COLORED_POINT_FILE * size.seen * size.points * size.images, "fit without diffusion": fit,
         "synthesize": LINE_FILE * len(config.synthesize.shifts_m) + VIEW_FILE * made * pixels, "fit with diffusion": fit,
-        "render without diffusion": render, "render with diffusion": render, "score": SCORE_FILE * scored * pixels,
-        "viewer": VIEWER_GAUSSIAN_FILE * gaussians, "report": min(REPORT_LARGEST, REPORT_FILE * rendered * pixels) + REPORT_ADAPTED_FILE * _adapts(config, size),
+        "render without diffusion": render, "render with diffusion": render, "score": score,
+        "viewer": VIEWER_GAUSSIAN_FILE * gaussians, "report": report,
     }  # fmt: skip
     return {name: round(value) for name, value in steps.items()}
 
