@@ -150,6 +150,8 @@ def test_a_log_without_labels_is_annotated_and_adapted_to() -> None:
     off = replace(run_preset(), adaptation="off")
     assert "adapt" not in cost.estimate(off, log, cost.Machine(2)).steps
     assert not {"annotate", "adapt"} & set(cost.estimate(run_preset(), DEMO, cost.Machine(2)).steps)
+    row = next(line for line in cost.in_words(cost.of_presets(log, cost.Machine(2)), 0) if line.strip().startswith("adapt "))
+    assert row.count("not taken") == 1, "the preset paper does not adapt"
     longer = cost.estimate(run_preset(), replace(log, images=144, path_images=48), cost.Machine(2)).steps
     assert all((longer[name].processor_s or 0) > (found[name].processor_s or 0) for name in ("annotate", "adapt"))
 

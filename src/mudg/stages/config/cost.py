@@ -401,13 +401,19 @@ def in_words(
         able = [name for name, one in found.items() if fits_machine(one, free_bytes, free_disk_bytes)]
         lines.append(f"  memory and disk of this machine suffice for: {', '.join(able) or 'none (smaller images, fewer frames)'}")
     lines.append(f"  {'per step: time, memory, disk':<30}" + "".join(f"{name:>26}" for name in found))
-    for step in next(iter(found.values())).steps:
-        cells = [
-            f"{'-' if cost.seconds is None else _duration(cost.seconds)}, {cost.memory_bytes / 1e9:.1f} GB, {_size(cost.written_bytes)}"
-            for cost in (one.steps[step] for one in found.values())
-        ]
+    longest = max((one.steps for one in found.values()), key=len)
+    for step in longest:
+        cells = [_cell(one.steps.get(step)) for one in found.values()]
         lines.append(f"    {step:<28}" + "".join(f"{cell:>26}" for cell in cells))
     return lines
+
+
+def _cell(cost: StepCost | None) -> str:
+    """A step in the table; a preset may leave one out."""
+    if cost is None:
+        return "not taken"
+    time = "-" if cost.seconds is None else _duration(cost.seconds)
+    return f"{time}, {cost.memory_bytes / 1e9:.1f} GB, {_size(cost.written_bytes)}"
 
 
 def fits_machine(one: Estimate, free_bytes: int, free_disk_bytes: int) -> bool:
