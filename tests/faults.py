@@ -77,6 +77,16 @@ def killed(number: int) -> Act:
     return act
 
 
+def terminated(number: int) -> Act:
+    """The process is asked to stop (SIGTERM) before the operation of this number."""
+
+    def act(count: int, _name: str) -> None:
+        if count == number:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    return act
+
+
 def in_child(work: Callable[[], Any], act: Act, root: Path) -> int:
     """Do the work in a copy of this process; returns its exit status, negative for the signal that ended it.
 

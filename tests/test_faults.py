@@ -13,17 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from faults import contents, failing, in_child, killed, points
+from faults import contents, failing, in_child, killed, points, terminated
 from test_nothing_is_lost import HISTORY, VERBS, quick_bench, world  # noqa: F401
+from toy_clips import tiny, write_clips
 
+from mudg import cli
 from mudg.base import store
 from mudg.base.errors import ResourceError
 from mudg.base.replacement import Replacement
 from mudg.base.run_folder import RunDir, VerbOutput
+from mudg.stages import learn
 
 OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))
 SWEPT = [name for name in VERBS if name not in ("learn", "bench", "film")]
-"""Verbs that do their work in this process; ``learn`` has its own tests of kills, the others write through the same store."""
+"""Verbs that do their work in this process; ``learn`` has its own sweep below, the others write through the same store."""
 
 
 @pytest.fixture(autouse=True)
@@ -184,6 +187,56 @@ def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dic
         VERBS[name].call(given, place / "out", 1, False)
         same_result(name, place / "out", tmp_path / "whole")
     assert all("No space left" in words for words in said)
+
+
+# ---- training ------------------------------------------------------------------------------------------------------------
+
+
+def small_training(clips: Path, out: Path) -> Path:
+    """``mudg learn`` in a moment: codec, steps, checkpoints, scores, model; stops on SIGTERM as the command does."""
+    with cli._sigterm_interrupts():
+        return learn.run(tiny(clips), out)
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes], int]:
+    """Clips; the weights, scores and last checkpoint of an undisturbed training on them; the number of its operations on the disk."""
+    root = tmp_path_factory.mktemp("training").resolve()
+    write_clips(root / "clips")
+    total = len(counted(lambda: small_training(root / "clips", root / "x" / "out"), root / "x"))
+    assert total > 20
+    return root / "clips", learned(root / "x" / "out"), total
+
+
+def learned(out: Path) -> dict[str, bytes]:
+    """What a training leaves, without its history: earlier checkpoints, of which being asked to stop makes one more, and how it went."""
+    last = max((out / "steps").glob("step_*")).name
+    return {
+        name: content for name, content in contents(out).items()
+        if name not in HISTORY["learn"] | {"manifest.json"} and (not name.startswith("steps/") or name.startswith(f"steps/{last}/"))
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("most", [1, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stopped", [killed, terminated])
+def test_a_training_stopped_at_every_point_is_repeated_to_the_same_bytes(
+    stopped: Any, most: int, training: tuple[Path, dict[str, bytes], int], tmp_path: Path
+) -> None:
+    """Killed, and asked to stop: the repeated command ends in the weights and scores of an undisturbed training, to the bit."""
+    clips, whole, total = training
+    chosen = range(1, total + 1) if most >= total else sorted(random.Random(stopped.__name__).sample(range(1, total + 1), most))
+    for number in chosen:
+        place = tmp_path / f"stop{number}"
+        place.mkdir()
+        status = in_child(lambda place=place: small_training(clips, place / "out"), stopped(number), place)
+        assert status == -9 if stopped is killed else status in (0, 1), number  # asked at the very end, it finishes
+        small_training(clips, place / "out")
+        found = learned(place / "out")
+        assert found.keys() == whole.keys(), number
+        assert [name for name in found if found[name] != whole[name]] == [], number
+        store.verify_manifest(place / "out")
+        assert not leftovers(place) and not [p for p in place.rglob("*") if ".part" in p.name or p.name.startswith(".tmp")], number
+        shutil.rmtree(place)
 
 
 # ---- soak ----------------------------------------------------------------------------------------------------------------

@@ -94,6 +94,8 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "complete"
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
+    files = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name not in ("run.json", "run.yaml")]
+    assert sum(step["written_bytes"] for step in ledger["steps"].values()) == sum(path.stat().st_size for path in files) > 0
 
 
 def test_a_recorded_log_is_adapted_to(tmp_path: Path, verbs: dict[str, Any]) -> None:

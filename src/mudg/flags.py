@@ -7,7 +7,7 @@ import ast
 import contextlib
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -454,19 +454,67 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
     default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(kind, words))
     _explain(flags, {})
     try:
-        return tyro.cli(flags, args=list(words), default=default, prog=f"mudg {verb}", description=description)
+        with _boxes_held() as held:
+            return tyro.cli(flags, args=list(words), default=default, prog=f"mudg {verb}", description=description)
     except OSError:
         if {"-h", "--help"} & set(words):
             raise
         failures.silence(2)
         raise SystemExit(UsageError.exit_code) from None  # what is wrong could not be written, but stays wrong
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"]).replace("_", "-")
-        raise UsageError(
-            "a flag's value is not valid", where=f"--{field}", expected=first["msg"], got=repr(first.get("input"))[:120],
-            remedy=f"see mudg {verb} --help",
-        ) from error  # fmt: skip
+        raise _refused(verb, error, "") from error
+    except SystemExit as leaving:
+        _refuse_nested(verb, leaving)
+        try:
+            sys.stderr.write(held.getvalue())
+            sys.stderr.flush()
+        except (OSError, ValueError, AttributeError):  # on a full disk; closed; never opened
+            failures.silence(2)
+        raise
+
+
+class _HeldText(io.StringIO):
+    """What is written to standard error, kept; it looks like the terminal that it may go to."""
+
+    def __init__(self, real: Any) -> None:
+        super().__init__()
+        self._real = real
+
+    def isatty(self) -> bool:
+        return bool(self._real is not None and self._real.isatty())
+
+
+@contextlib.contextmanager
+def _boxes_held() -> Iterator[_HeldText]:
+    """Keep tyro's messages until it is known whether one of our own takes their place."""
+    held = _HeldText(sys.stderr)
+    with contextlib.redirect_stderr(held):
+        yield held
+
+
+def _refuse_nested(verb: str, leaving: SystemExit) -> None:
+    """UsageError where tyro leaves because the values of a group of settings (``--loss.ssim-weight``) are not valid.
+
+    tyro takes pydantic's error for one of its own, since it is a ValueError, and would print it as it is; that error is what the
+    exit came from.
+    """
+    caught, group = leaving.__context__, ""
+    while caught is not None and not isinstance(caught, ValidationError):
+        arg = getattr(caught, "arg", None)
+        group = arg if isinstance(arg, str) else group
+        caught = caught.__context__
+    if caught is not None:
+        raise _refused(verb, caught, group.removeprefix("settings").removeprefix(".")) from caught
+
+
+def _refused(verb: str, error: ValidationError, group: str) -> UsageError:
+    """The first wrong value of a group of settings (empty: the verb's own), with the flag that gives it."""
+    first = error.errors(include_url=False)[0]
+    flag = ".".join(part for part in (group, *map(str, first["loc"])) if part).replace("_", "-")
+    return UsageError(
+        "a flag's value is not valid", where=f"--{flag}" if flag else f"mudg {verb}", expected=first["msg"],
+        got=repr(first.get("input"))[:120], remedy=f"see mudg {verb} --help",
+    )  # fmt: skip
 
 
 def _second_input_named(verb: str, words: Sequence[str]) -> Sequence[str]:

@@ -337,10 +337,14 @@ class RunDir:
         spent = self.spent_before().then(self._meter.usage()).record()
         values = {
             "schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state,
-            **spent, "written_bytes": folder_bytes(self.path), "files": list(self._output.files), "environment": environment(),
+            **spent, "written_bytes": self._written_bytes(), "files": list(self._output.files), "environment": environment(),
             "summary": dict(summary),
         }  # fmt: skip
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
+
+    def _written_bytes(self) -> int:
+        """Size of the folder's files, without the record in which this number stands."""
+        return folder_bytes(self.path) - sum(folder_bytes(self.path / name) for name in (_STATE, _LOCK))
 
     def spent_before(self) -> Usage:
         """What earlier, interrupted runs of this same key have taken."""

@@ -7,6 +7,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,7 +17,11 @@ from mudg.base import memory
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from mudg.base.types import Scene, View
     from mudg.data.scene.check import Finding
+    from mudg.stages.config.cost import SceneSize
 
 _CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av", "jinja2")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
@@ -104,26 +109,73 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     import torch
 
     from mudg import native
+    from mudg.core.raster import probe
     from mudg.data.scene import read_scene
     from mudg.stages.config import cost
 
     scene = read_scene(path)
-    first = scene.frames[0].view.camera
-    size = cost.SceneSize(len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height)
+    cores = native.default_threads()
+    size, machine = _size(scene), cost.Machine(cores, probe.speed(cores), os.cpu_count() or 1)
     devices = {"cpu": memory.free_bytes()}
     if torch.cuda.is_available():
         devices["cuda"] = torch.cuda.mem_get_info()[0]
+    disk = shutil.disk_usage(Path.cwd()).free
     records: dict[str, Any] = {}
     lines = []
     for device, free in devices.items():
-        found = cost.of_presets(size, native.default_threads(), device)
-        lines += cost.in_words(found, free, device)
+        found = cost.of_presets(size, machine, device)
+        lines += cost.in_words(found, free, device, disk)
         records[device] = {
-            name: {"seconds": dict(one.seconds), "total_s": one.total_s, "memory_bytes": one.memory_bytes,
-                   "fits": one.memory_bytes <= free if free else None}
+            name: {"seconds": one.seconds, "total_s": one.total_s, "memory_bytes": one.memory_bytes, "written_bytes": one.written_bytes,
+                   "fits": cost.fits_machine(one, free, disk) if free else None,
+                   "steps": {step: asdict(of) for step, of in one.steps.items()}}
             for name, one in found.items()
         }  # fmt: skip
+    lines.append(
+        f"speed of this machine at the moment: {machine.speed:.2f} of the one that forecasts were measured on, {cores} threads"
+    )
     return records, lines
+
+
+def _size(scene: Scene) -> SceneSize:
+    """What forecasts depend on. The first sweep stands for all."""
+    import numpy as np
+
+    from mudg.data.scene import read_points
+    from mudg.stages.adapting.clips import why_not
+    from mudg.stages.config import run_preset
+    from mudg.stages.config.cost import SceneSize
+
+    first = scene.frames[0].view.camera
+    sweep = scene.sweeps[0] if scene.sweeps else None
+    xyz = read_points(scene, sweep).xyz if sweep else np.zeros((0, 3), np.float32)
+    seen = (
+        _share_in_image(scene.frames[0].view, xyz @ sweep.world_from_lidar[:3, :3].T + sweep.world_from_lidar[:3, 3])
+        if sweep
+        else 0.0
+    )
+    exact = scene.source.recipe is not None
+    adapt = run_preset().adapt
+    return SceneSize(
+        len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height, len(xyz), exact, seen=seen,
+        labelled=all("semantics" in frame.labels for frame in scene.frames),
+        adapts=not exact and not why_not(scene, replace(adapt, cameras=(first.name,))),
+    )  # fmt: skip
+
+
+def _share_in_image(view: View, world: np.ndarray) -> float:
+    """Share of points (N, 3), in metres of the world, that project into a view; what hides them is not asked."""
+    import numpy as np
+
+    camera_from_world = np.linalg.inv(view.world_from_cam)
+    x, y, z = (world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]).T
+    ahead = z > 0.1
+    u, v = (
+        view.camera.fx * x[ahead] / z[ahead] + view.camera.cx,
+        view.camera.fy * y[ahead] / z[ahead] + view.camera.cy,
+    )
+    inside = (u >= 0) & (u < view.camera.width) & (v >= 0) & (v < view.camera.height)
+    return float(inside.sum()) / max(1, len(world))
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

@@ -278,6 +278,10 @@ def _train_network(
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
+    watch = partial(_score_watched, model, config, run_dir, folder, bf16)
+    if begun and _is_watched(config, begun) and not ranks.leader_does(lambda: _picture(run_dir, begun).is_file()):
+        made = state.export_weights(ranks)  # it was stopped between the checkpoint and the picture
+        ranks.leader_does(partial(watch, made, begun))
     with (
         log.task("network", config.steps, begun) as bar, Interruption(SAME_SIGNAL_S) as interruption,
         _reading_ahead(config, folder, ranks) as ahead,
@@ -317,15 +321,24 @@ def _train_network(
                 took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
                 log.info(f"learn: checkpoint of step {done} in {took_s:.2f} s")
                 saved_at = done
-            if done % config.score.every == 0 or last:
+            if _is_watched(config, done):
                 made = state.export_weights(ranks)
-                ranks.leader_does(partial(_score_watched, model, made, config, run_dir, folder, done, bf16))
+                ranks.leader_does(partial(watch, made, done))
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
                 interruption.stop_now()
     if board is not None:
         board.close()
     return state.export_weights(ranks)
+
+
+def _is_watched(config: LearnConfig, step: int) -> bool:
+    """Whether a few held-out clips are scored and drawn after so many steps."""
+    return step % config.score.every == 0 or step == config.steps
+
+
+def _picture(run_dir: RunDir, step: int) -> Path:
+    return run_dir.path / "samples" / f"{step:07d}.png"
 
 
 def _record(run_dir: RunDir, board: Any, step: int, values: dict[str, float]) -> None:
@@ -344,14 +357,13 @@ def _tensorboard(folder: Path) -> Any:
 
 
 def _score_watched(
-    model: Model, weights: dict[str, Tensor], config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, step: int,
-    bf16: bool,
+    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, weights: dict[str, Tensor],
+    step: int,
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
     made = kind_of(model).rebuilt(model, weights)
     shards = learn_clips.scored_shards(config, folder)[: config.score.watched]
     request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-    picture = run_dir.path / "samples" / f"{step:07d}.png"
-    scores = learn_score.score(made, shards, folder, request, picture=picture)
+    scores = learn_score.score(made, shards, folder, request, picture=_picture(run_dir, step))
     run_dir.log(step=step, held_out=scores["average"])
     log.info(f"step {step}\n{learn_score.table(scores)}")

@@ -354,8 +354,10 @@ class _Ledger:
         return self._report.get("key") == key and page.is_file() and self._report["sha256"] == store.sha256_file(page)
 
     def remember_report(self, key: str) -> None:
-        """Note what the page was made of."""
-        self._report = {"key": key, "sha256": store.sha256_file(self._out / "report.html")}
+        """Note what the page was made of, and its size: it is written after its step was noted."""
+        page = self._out / "report.html"
+        self._report = {"key": key, "sha256": store.sha256_file(page)}
+        self._steps["report"]["written_bytes"] = folder_bytes(page)
         self.save("complete")
 
     def timed(self, step: Step) -> Any:
