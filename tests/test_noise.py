@@ -256,6 +256,46 @@ def test_every_sampler_takes_its_settings_and_no_other():
         noise.check_sampler("magic")
 
 
-def test_solver_refuses_what_it_does_not_know():
-    with pytest.raises(UsageError, match="rescale"):
-        noise.dpm_solver(lambda x, t: x, torch.zeros(1, 2), Schedule(ScheduleConfig(base_scale=0.7)), [999, 499])
+@pytest.mark.parametrize("prediction", ["x0", "v"])
+def test_second_order_solver_follows_the_flow_under_the_dynamic_rescale(prediction):
+    """Data of one Gaussian, scaled as in training: the flow still maps x_T to mean + spread x_T, whose error falls with the square of
+    the step; the sample has no factor left, where that of ddim keeps the last step's."""
+    schedule, mean, spread = Schedule(ScheduleConfig(base_scale=0.7)), 0.7, 0.4
+    start = torch.linspace(-2, 2, 9, dtype=torch.float64).view(1, 9)
+
+    def denoise(x, t):
+        alpha, sigma, scale = (getattr(schedule, name)[t].double() for name in ("alpha", "sigma", "scale"))
+        factor = alpha * scale
+        x0 = mean + factor * spread**2 / (factor**2 * spread**2 + sigma**2) * (x - factor * mean)
+        return scale * x0 if prediction == "x0" else (alpha * x - scale * x0) / sigma
+
+    def made(sampler, steps, **settings):
+        return sampler(denoise, start, schedule, noise.trailing_steps(1000, steps), prediction=prediction, **settings)
+
+    exact = mean + spread * start
+    errors = [float((made(noise.dpm_solver, n) - exact).abs().max()) for n in (20, 80, 250)]
+    plain = [float((made(noise.ddim, n, eta=0.0) - exact).abs().max()) for n in (20, 80, 250)]
+    assert all(a < 0.8 * b for a, b in zip(errors, plain))
+    assert errors[2] < 0.02 and errors[0] > 3 * errors[2]
+    few = made(noise.dpm_solver, 4)
+    kept = float((made(noise.ddim, 4, eta=0.0) / few).mean())
+    assert kept == pytest.approx(float(schedule.scale[noise.trailing_steps(1000, 4)[-1]]), abs=0.05)
+
+
+def test_second_order_solver_with_rescale_follows_the_update_of_the_scaled_level():
+    """As `test_second_order_solver_follows_the_published_update`, with alpha times the rescale in place of alpha."""
+    schedule = Schedule(ScheduleConfig(base_scale=0.7))
+    output = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t  # noqa: E731
+    start = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    indices = [899, 599, 299, 49]
+    scale = schedule.scale[indices].double()
+    alpha, sigma = schedule.alpha_bar[indices].sqrt() * scale, (1 - schedule.alpha_bar[indices]).sqrt()
+    h = torch.log(alpha / sigma).diff()
+    x, estimates = start, []
+    for i in range(3):
+        estimates.append(output(x, indices[i]) / scale[i])
+        r = h[i - 1] / h[i]
+        mixed = estimates[-1] if i == 0 else (1 + 1 / (2 * r)) * estimates[-1] - estimates[-2] / (2 * r)
+        x = sigma[i + 1] / sigma[i] * x - alpha[i + 1] * torch.expm1(-h[i]) * mixed
+    made = noise.dpm_solver(output, start, schedule, indices)
+    assert torch.allclose(made, output(x, 49) / scale[3], atol=1e-6)

@@ -220,16 +220,16 @@ def dpm_solver(
 
     With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D is
     extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order, and so
-    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. A dynamic rescale
-    is refused. Arguments and result as for `ddim`.
+    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. With a dynamic
+    rescale, x_t is alpha_t scale_t x_0 + sigma_t eps: alpha times scale takes the place of alpha, and the result is x_0 itself,
+    without the factor that `ddim` leaves. Arguments and result as for `ddim`.
     """
-    if bool((schedule.scale != 1).any()):
-        raise UsageError("dpm_solver does not know the dynamic rescale", expected="sampler = ddim", got="base_scale set")
-    alpha, sigma = schedule.alpha_bar.sqrt(), (1 - schedule.alpha_bar).clamp(min=0).sqrt()
+    alpha = schedule.alpha_bar.sqrt() * schedule.scale.double()
+    sigma = (1 - schedule.alpha_bar).clamp(min=0).sqrt()
     level = torch.log(alpha / sigma)
     x, before, step_before = start, None, math.inf
     for number, t in enumerate(step_indices):
-        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0]
+        x0 = x0_and_eps(x, denoise(x, t), schedule.alpha[t], schedule.sigma[t], prediction)[0] / schedule.scale[t]
         if number + 1 == len(step_indices):
             return x0
         following = step_indices[number + 1]

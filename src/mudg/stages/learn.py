@@ -172,7 +172,9 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         config = learn_clips.of_one_size(config)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
-            ranks.leader_does(lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16, ranks.device))
+            ranks.leader_does(
+                lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16, ranks.device)
+            )
             learn_codec.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
         for name in ("refiner", "finisher", "effects"):
@@ -273,7 +275,9 @@ def _train_network(
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
     weights = _class_weights(config, folder).to(ranks.device)
-    settings = LossSettings(weights, config.loss.refined_share, config.data.reference_dropout, config.data.effect_dropout)
+    settings = LossSettings(
+        weights, config.loss.refined_share, config.data.reference_dropout, config.data.effect_dropout
+    )
     board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
@@ -357,7 +361,12 @@ def _tensorboard(folder: Path) -> Any:
 
 
 def _score_watched(
-    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, weights: dict[str, Tensor],
+    model: Model,
+    config: LearnConfig,
+    run_dir: RunDir,
+    folder: Path | ShardSource,
+    bf16: bool,
+    weights: dict[str, Tensor],
     step: int,
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""

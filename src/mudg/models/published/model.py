@@ -430,10 +430,6 @@ class PublishedMDM(nn.Module):
         request.sampler_settings()
         if request.start is not None:
             raise UsageError("only small models can begin from a given clip", where="start", remedy="choose another model")
-        if "last" not in noise.SAMPLER_SETTINGS[request.sampler]:
-            raise UsageError(
-                "the sampler does not suit a published-type model, which has a dynamic rescale and ends at the first noise level",
-                where="sampler", expected="ddim", got=request.sampler)  # fmt: skip
 
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
         """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same aspect."""
@@ -492,7 +488,8 @@ class PublishedMDM(nn.Module):
         streams = [seeds.torch_generator(request.seed, request.index * 64 + number, f"sample {m}") for m in names]
         draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)  # noqa: E731
         velocity = self._guided(encoded, names, tokens, request)
-        x, estimates = denoised(velocity, draw, self.schedule, request, "v", last="first_alpha")
+        ends = {"last": "first_alpha"} if request.sampler == "ddim" else {}
+        x, estimates = denoised(velocity, draw, self.schedule, request, "v", **ends)
         return {m: x[n] for n, m in enumerate(names)}, mean_change([e[0] for e in estimates], x[0])
 
     def _guided(
