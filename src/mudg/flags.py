@@ -7,7 +7,7 @@ import ast
 import contextlib
 import io
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -453,8 +453,9 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
     kind = get_type_hints(flags).get("settings")
     default = tyro.MISSING_NONPROP if kind is None else _with_settings(flags, _settings(kind, words))
     _explain(flags, {})
+    held = _HeldText(sys.stderr)  # the parser's messages, until it is known whether one of our own takes their place
     try:
-        with _boxes_held() as held:
+        with contextlib.redirect_stderr(held):
             return tyro.cli(flags, args=list(words), default=default, prog=f"mudg {verb}", description=description)
     except OSError:
         if {"-h", "--help"} & set(words):
@@ -482,14 +483,6 @@ class _HeldText(io.StringIO):
 
     def isatty(self) -> bool:
         return bool(self._real is not None and self._real.isatty())
-
-
-@contextlib.contextmanager
-def _boxes_held() -> Iterator[_HeldText]:
-    """Keep tyro's messages until it is known whether one of our own takes their place."""
-    held = _HeldText(sys.stderr)
-    with contextlib.redirect_stderr(held):
-        yield held
 
 
 def _refuse_nested(verb: str, leaving: SystemExit) -> None:
