@@ -12,10 +12,18 @@ from mudg.stages.learning.parallel import Ranks, Spread, gathered, join_processe
 from mudg.stages.learning.state import TrainingState
 
 
+class ToyBlocks(nn.Module):
+    """Two blocks with rows that 2 and 4 processes do not divide."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList([nn.Sequential(nn.Linear(7, 13), nn.GELU(), nn.Linear(13, 7)) for _ in range(2)])
+        self.norm = nn.LayerNorm(7)
+
+
 def state_of(ranks: Ranks, layout: str) -> tuple[TrainingState, nn.Module]:
     torch.manual_seed(0)
-    block = lambda: nn.Sequential(nn.Linear(7, 13), nn.GELU(), nn.Linear(13, 7))  # noqa: E731  rows that 2 and 4 do not divide
-    trained = nn.ModuleDict({"net": nn.ModuleList([block(), block(), nn.LayerNorm(7)])})
+    trained = nn.ModuleDict({"net": ToyBlocks()})
     Spread(trained, trained, ranks, layout, 2 if layout == "hsdp" else 0)
     optimizer = torch.optim.AdamW(trained.parameters(), lr=1e-2, fused=True)
     return TrainingState(trained, optimizer, {k: v.detach().clone() for k, v in trained.state_dict().items()}), trained

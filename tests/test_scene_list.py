@@ -153,7 +153,7 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
         for n in names
     )
     assert not (tmp_path / "whole" / "cache").exists()
-    with pytest.raises(UsageError, match="--out"):
+    with pytest.raises(UsageError, match="lies in an input"):
         learn.run(from_list(text), tmp_path / "scenes" / "1" / "out")
     with pytest.raises(UsageError, match="list of scenes says"):
         learn.run(tiny(clips, scenes=(text,)), tmp_path / "both")

@@ -159,6 +159,9 @@ def join_processes(wanted: str) -> Iterator[Ranks]:
         yield _ranks_on_device(0, 1, wanted)
         return
     place = _ranks_on_device(rank, size, wanted)
+    if place.leads and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True" and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
+        log.warn("learn: restarted processes may find each other's old addresses in the launcher's store and fail; "
+                 "start torchrun with TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1")  # fmt: skip
     dist.init_process_group("nccl" if place.device.type == "cuda" else "gloo", timeout=PATIENCE)
     was_quiet = log.is_quiet()
     log.set_quiet(was_quiet or rank > 0)
