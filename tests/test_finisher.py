@@ -258,7 +258,7 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch):
     clip_number = torch.arange(2).repeat_interleave(frames).view(-1, 1, 1, 1)
     ramp = torch.cat([x.expand(2 * frames, 1, height, width).float() for x in (rows, columns, clip_number)], 1)
 
-    def refined(latents, pixels, frames):
+    def refined(latents, pixels, frames, effects):
         one = ramp[:, :1]
         return Refined(ramp, one, functional.one_hot(torch.zeros(len(ramp), height, width).long(), 19).permute(0, 3, 1, 2), one)
 

@@ -12,7 +12,7 @@ from fit_settings import fit_config
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from toy_world import fused_cloud, write_scene
 
-from mudg.base import geometry, store
+from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.renders import RenderPlanes
@@ -315,6 +315,7 @@ def with_effects(run: Path) -> str:
 
 
 def test_weather_is_corrected_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
+    log.set_quiet(False)  # a command before may have been asked to be
     edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
     plain = RenderConfig(shifts_m=(0.0,), video=False)
 

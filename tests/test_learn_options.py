@@ -169,7 +169,7 @@ def test_old_names_lead_to_settings_that_exist():
 
 def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "training.md").read_text()
-    (tmp_path / "stage1.yaml").write_text(text.split("```yaml\n")[1].split("```")[0])
+    (tmp_path / "stage1.yaml").write_text(text.partition("`stage1.yaml`:")[2].split("```yaml\n")[1].split("```")[0])
     config = load(LearnConfig, None, tmp_path / "stage1.yaml")
     assert config.optimizer.betas == (0.9, 0.999) and config.compute.parallel == "fsdp" and not config.data.augment
 

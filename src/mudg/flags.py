@@ -547,12 +547,9 @@ def _settings(kind: type[Any], words: Sequence[str]) -> Any:
     config = stage_config.run_preset(stage_config.chosen_preset(known.preset, known.fast)) if whole_chain else kind()
     if known.config is not None and kind is not stage_config.BatchConfig:  # there, the file is one of mudg run
         config = configuration.load(kind, config, known.config)
-    if whole_chain and known.seed is not None:
-        config = stage_config.with_seed(config, known.seed)
     if whole_chain:
-        cameras = tuple(known.cameras) if known.cameras else None
-        shifts_m = tuple(known.shifts_m) if known.shifts_m else None
-        config = stage_config.with_lines(config, cameras=cameras, shifts_m=shifts_m)
+        config = config if known.seed is None else stage_config.with_seed(config, known.seed)
+        config = stage_config.with_lines(config, cameras=tuple(known.cameras or ()) or None, shifts_m=tuple(known.shifts_m or ()) or None)
     return config
 
 

@@ -21,7 +21,7 @@ import hashlib
 import importlib.util
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -274,18 +274,13 @@ def _train_network(
     """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
     out = run_dir.path / "steps"
     state, spread = _begin(model, config, out, ranks)
-    weights = _class_weights(config, folder).to(ranks.device)
-    settings = LossSettings(
-        weights, config.loss.refined_share, config.data.reference_dropout, config.data.effect_dropout
-    )
+    settings = _loss_settings(config, _class_weights(config, folder).to(ranks.device))
     board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
     watch = partial(_score_watched, model, config, run_dir, folder, bf16)
-    if begun and _is_watched(config, begun) and not ranks.leader_does(lambda: _picture(run_dir, begun).is_file()):
-        made = state.export_weights(ranks)  # it was stopped between the checkpoint and the picture
-        ranks.leader_does(partial(watch, made, begun))
+    _watch_missed(state, config, run_dir, ranks, watch)
     with (
         log.task("network", config.steps, begun) as bar, Interruption(SAME_SIGNAL_S) as interruption,
         _reading_ahead(config, folder, ranks) as ahead,
@@ -298,8 +293,8 @@ def _train_network(
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
             for part in parts:
-                clips = draw_clips(config, folder, step, count, frames, "batch", part)
-                clips = [clip.to(ranks.device) for clip in clips]
+                drawn = draw_clips(config, folder, step, count, frames, "batch", part)
+                clips = [clip.to(ranks.device) for clip in drawn]
                 with spread.portion(last=part is parts[-1]):
                     with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):
                         loss = spread.network(clips, BatchPart(config.seed, step, part.start, count), settings)
@@ -334,6 +329,25 @@ def _train_network(
     if board is not None:
         board.close()
     return state.export_weights(ranks)
+
+
+def _loss_settings(config: LearnConfig, class_weights: Tensor) -> LossSettings:
+    data = config.data
+    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout, data.effect_dropout)
+
+
+def _watch_missed(
+    state: TrainingState,
+    config: LearnConfig,
+    run_dir: RunDir,
+    ranks: Ranks,
+    watch: Callable[[dict[str, Tensor], int], None],
+) -> None:
+    """Score and draw after a training that was stopped between a checkpoint and its picture."""
+    done = state.step
+    if done and _is_watched(config, done) and not ranks.leader_does(lambda: _picture(run_dir, done).is_file()):
+        made = state.export_weights(ranks)
+        ranks.leader_does(partial(watch, made, done))
 
 
 def _is_watched(config: LearnConfig, step: int) -> bool:

@@ -119,7 +119,9 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
 
 def _empty_renders(condition: Condition) -> RenderPlanes:
     nothing = torch.zeros_like(condition.depth)
-    return RenderPlanes(condition.color, nothing, nothing, nothing, torch.full_like(condition.valid, 255, dtype=torch.uint8))
+    return RenderPlanes(
+        condition.color, nothing, nothing, nothing, torch.full_like(condition.valid, 255, dtype=torch.uint8)
+    )
 
 
 def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
@@ -150,9 +152,13 @@ def clips_at(path: Path) -> int:
         return int(shard.get_slice("shift_m").get_shape()[0])
 
 
-def frames_in(folder: Path, city: int) -> int:
+def frames_in(folder: Path | ShardSource, city: int) -> int:
     """Frames of each clip in a shard."""
-    with _open(shard_path(folder, city)) as shard:
+    return _frames_at(shard_path(folder, city)) if isinstance(folder, Path) else folder.reading(city, _frames_at)
+
+
+def _frames_at(path: Path) -> int:
+    with _open(path) as shard:
         return int(shard.get_slice("rgb").get_shape()[1])
 
 
@@ -192,7 +198,11 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     """A clip, or its patch, from the arrays whose names begin with `prefix`."""
     there = set(shard.keys())
     rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
-    names = [*_PER_FRAME, *(("point_color",) if f"{prefix}point_color" in there else ()), *(_RENDERS if rendered else ())]
+    names = [
+        *_PER_FRAME,
+        *(("point_color",) if f"{prefix}point_color" in there else ()),
+        *(_RENDERS if rendered else ()),
+    ]
     found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
     reference = torch.from_numpy(shard.get_slice(f"{prefix}reference")[clip])
     shift_m = float(shard.get_tensor(f"{prefix}shift_m")[clip])
