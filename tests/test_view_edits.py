@@ -186,7 +186,9 @@ def opened(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Brows
     root = tmp_path_factory.mktemp("page")
     made = view.page_of(PageConfig(images=0), view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]),)))
     made = replace(made, log=with_ground(made.log, hilly()))
-    (root / "page.html").write_bytes(made.one_file(*made.build()))
+    facts: dict = {}
+    files = list(made.files(facts))
+    (root / "page.html").write_bytes(made.one_file(files, facts))
     one = Browser(tmp_path_factory.mktemp("profile"), size=(900, 600))
     try:
         one.open(f"file://{root / 'page.html'}#m=recorded&c=front&t=0.4")

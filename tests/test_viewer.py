@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import http.client
 import json
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +24,8 @@ from mudg.base.palette import ID
 from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
-from mudg.report.viewer.packed import BLOCK, blob_of, morton_codes, pack_scene, smallest_three
+from mudg.report.viewer.chunks import coverage, level_of, morton_codes, opacity_of
+from mudg.report.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
 from mudg.stages.config.view import PageConfig, ViewConfig
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import view
@@ -54,7 +59,7 @@ def test_rotations_lose_less_than_a_quarter_of_a_degree() -> None:
 def test_places_and_sizes_are_kept_within_their_steps() -> None:
     model = toy_fitted(degree=3)
     packed = pack_scene(model, 0.0)
-    s = packed.sections
+    s, _ = packed.chunk(0)
     opacity = torch.sigmoid(model.table["logits"].detach()).numpy()
     assert packed.kept == len(s["certainty"]) == (opacity >= 1 / 255).sum()
     levels = (s["position"][:3].astype(np.int64) | s["position"][3:].astype(np.int64) << 8).T
@@ -75,12 +80,59 @@ def test_places_and_sizes_are_kept_within_their_steps() -> None:
 def test_a_budget_keeps_what_the_path_sees_largest() -> None:
     model = toy_fitted(degree=0)
     packed = pack_scene(model, 0.0, np.array([[0.0, 0, 1.2]]), most=200)
-    assert (packed.kept, packed.given) == (200, len(model.table))
+    assert (packed.kept, packed.layout.given) == (200, len(model.table))
+    worth = coverage(columns_of(model), model.table.labels["node"].numpy(), np.array([[0.0, 0, 1.2]]))
+    drawn = opacity_of(columns_of(model)["logits"]) >= 1 / 255
+    left_out = np.setdiff1d(np.flatnonzero(drawn), packed.layout.rows)
+    assert worth[left_out].max() <= worth[packed.layout.rows].min()
+    assert packed.layout.lost == pytest.approx(worth[left_out].sum() / worth[drawn].sum())
+    assert packed.layout.visible == drawn.sum()
+
+
+def columns_of(model: SceneModel) -> dict[str, np.ndarray]:
+    return {name: value.detach().numpy() for name, value in model.table.columns.items()}
+
+
+def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None:
+    model, size = toy_fitted(degree=1), 64
+    path = np.array([[0.0, 0, 1.2], [4.0, 0, 1.2]])
+    packed = pack_scene(model, 0.0, path, chunk_rows=size)
+    drawn = np.flatnonzero(opacity_of(columns_of(model)["logits"]) >= 1 / 255)
+    chunks = [packed.layout.chunk(k) for k in range(len(packed.layout))]
+    assert np.array_equal(np.sort(np.concatenate(chunks)), drawn)
+    assert [len(c) for c in chunks[:-1]] == [size] * (len(chunks) - 1)
+    assert 0 < len(chunks[-1]) <= size
+    assert [level_of(k) for k in range(8)] == [0, 1, 1, 2, 2, 2, 2, 3]
+    worth = coverage(columns_of(model), model.table.labels["node"].numpy(), path)
+    levels = [np.concatenate([c for k, c in enumerate(chunks) if level_of(k) == n]) for n in range(level_of(len(chunks) - 1) + 1)]
+    for one, following in zip(levels, levels[1:]):
+        assert worth[one].min() >= worth[following].max()
+
+
+def test_a_chunk_says_where_it_is_and_what_it_holds() -> None:
+    model = toy_fitted(degree=3)
+    packed = pack_scene(model, 0.0, chunk_rows=128)
+    node, means = model.table.labels["node"].numpy(), columns_of(model)["means"]
+    for index in range(len(packed.layout)):
+        rows = packed.layout.chunk(index)
+        sections, record = packed.chunk(index)
+        still = means[rows[node[rows] == 0]]
+        assert record["rows"] == len(rows) == sections["block_of"][:, 1].sum() == sections["color"].shape[1]
+        assert (record["box"] is None) == (len(still) == 0)
+        if record["box"] is not None:
+            assert np.abs(np.array(record["box"]) - [still.min(0), still.max(0)]).max() < 1e-3
+        assert record["moves"] == bool((node[rows] != 0).any())
+        assert sections["harmonics"].shape == (45, len(rows))
+
+
+def test_more_than_a_page_holds_is_refused() -> None:
+    with pytest.raises(UsageError, match="--budget"):
+        pack_scene(toy_fitted(degree=0), 0.0, chunk_rows=2)
 
 
 def test_neighbours_on_the_curve_are_neighbours_in_space() -> None:
     places = np.random.default_rng(1).uniform(0, 1, (500, 3))
-    order = np.argsort(morton_codes(places, np.zeros(500, np.int64)))
+    order = np.argsort(morton_codes(places, np.zeros(500, np.int64), np.arange(500)))
     steps = np.linalg.norm(np.diff(places[order], axis=0), axis=1).mean()
     assert steps < 0.4 * np.linalg.norm(np.diff(places, axis=0), axis=1).mean()
 
@@ -124,13 +176,74 @@ def test_a_page_is_not_replaced_without_being_asked(toy: tuple[Path, Path, Scene
         view.run_page(PageConfig(), toy[1], toy[0] / "other.html")
 
 
-def test_a_large_page_becomes_a_folder(
+def folder_page(
+    toy: tuple[Path, Path, SceneModel], root: Path, monkeypatch: pytest.MonkeyPatch, config: PageConfig | None = None
+) -> tuple[Path, dict[str, Any]]:
+    """A page in a folder with chunks of 64 Gaussians, and its facts."""
+    monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
+    monkeypatch.setattr(view, "CHUNK", 64)
+    made = view.run_page(config or PageConfig(images=3), toy[1], root / "page.html", scene=toy[0] / "scene", overwrite=True)
+    assert made["page"] == root / "page_page" / "index.html"
+    text = made["page"].read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="facts">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    return made["page"].parent, json.loads(found[1])
+
+
+def test_a_large_page_becomes_a_folder_whose_files_it_knows(
     toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
-    made = view.run_page(PageConfig(images=0), toy[1], tmp_path / "page.html", scene=toy[0] / "scene")
-    assert made["page"] == tmp_path / "page_page" / "index.html"
-    assert (tmp_path / "page_page" / "scene-0.bin").stat().st_size > 1000
+    (tmp_path / "page.html").write_text("an older page")
+    folder, facts = folder_page(toy, tmp_path, monkeypatch)
+    (scene,) = facts["scenes"]
+    assert len(scene["chunks"]) > 10
+    assert sum(chunk["rows"] for chunk in scene["chunks"]) == scene["rows"]
+    records = [facts["log"]["file"], facts["images"]["file"], scene["file"], *(chunk["file"] for chunk in scene["chunks"])]
+    for record in records:
+        content = (folder / record["url"]).read_bytes()
+        assert record["bytes"] == len(content)
+        assert base64.b64decode(record["sha256"]) == hashlib.sha256(content).digest()
+    assert {path.name for path in folder.iterdir()} == {"index.html", *(record["url"] for record in records)}
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_folder_is_made_alike_twice(
+    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def content() -> dict[str, bytes]:
+        folder, _ = folder_page(toy, tmp_path, monkeypatch)
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    first = content()
+    assert content() == first
+
+
+def test_a_folder_of_something_else_is_not_replaced(
+    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "page_page").mkdir()
+    (tmp_path / "page_page" / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="not a page"):
+        folder_page(toy, tmp_path, monkeypatch)
+
+
+def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, SceneModel]) -> None:
+    from mudg.data.scene import read_scene
+
+    scene = read_scene(toy[0] / "scene")
+    page = view.page_of(PageConfig(images=0, budget=500), view.Shown(scene, (("fit", toy[2]),)))
+    said = view.needs_text(page, "page.html", "0.1 MB")
+    kept = page.scenes[0][1]
+    assert said.count("500 Gaussians of 900 (") == 1
+    assert f"{kept.layout.visible - 500} left out for the budget" in said
+    assert page.graphics_bytes() == 500 * (5 * 16 + 4)  # degree 3: five texels
+
+
+def whole_page(page: viewer_page.ViewerPage) -> bytes:
+    """A page of one file."""
+    facts: dict[str, Any] = {}
+    files = list(page.files(facts))
+    return page.one_file(files, facts)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -222,7 +335,7 @@ def test_names_from_a_log_do_not_run(opened: Browser, toy: tuple[Path, Path, Sce
     scene = read_scene(toy[0] / "scene")
     hostile = replace(scene, id=name, tracks=(replace(scene.tracks[0], id=name, label=name),))
     page = view.page_of(PageConfig(images=0), view.Shown(hostile, (("fit", toy[2]),)))
-    (tmp_path / "page.html").write_bytes(page.one_file(*page.build()))
+    (tmp_path / "page.html").write_bytes(whole_page(page))
     opened.open(f"file://{tmp_path / 'page.html'}")
     assert name in opened.run("document.querySelector('#objects .name').textContent")
     assert opened.run("document.querySelector('h1').textContent") == opened.run("document.title") == name
@@ -265,7 +378,11 @@ def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> Non
     assert ask(port, "GET", "/")[0] == 403
     assert ask(port, "GET", "/?token=wrong")[0] == 403
     assert ask(port, "GET", f"/?token={token}", Host="evil.example")[0] == 403
-    assert ask(port, "GET", "/scene-0.bin", Cookie=f"mudg_token={token}")[0] == 200
+    page = ask(port, "GET", "/", Cookie=f"mudg_token={token}")[1].decode()
+    chunk = re.findall(r'"url":"(scene-0-000-[0-9a-f]{8}\.bin)"', page.replace(": ", ":"))
+    assert len(chunk) == 1
+    assert ask(port, "GET", f"/{chunk[0]}", Cookie=f"mudg_token={token}")[0] == 200
+    assert ask(port, "GET", f"/{chunk[0]}")[0] == 403
     for path in ("/../fit/model.json", "/%2e%2e/model.json", "//etc/passwd", "/model.json"):
         assert ask(port, "GET", path, Cookie=f"mudg_token={token}")[0] == 404
     own = f"http://127.0.0.1:{port}"

@@ -1,5 +1,6 @@
 // Holds the page together: data, state, renderer and overlay; decides what is drawn when. The controls are in ui.js.
 
+import { Arrival } from "mudg/arrival";
 import { Cameras, Drive } from "mudg/cameras";
 import { SplatScene, bytesOf, inflate, sectionsOf } from "mudg/data";
 import { PoseKeys, clamp } from "mudg/math";
@@ -10,6 +11,7 @@ import { fromHash, initialState, toHash } from "mudg/state";
 const REST_MS = 180; // without a change: draw at full size
 const SLOW_MS = 45, QUICK_MS = 18; // of a frame while moving: draw smaller, or larger again
 const SMALLEST = 0.22;
+const FRESH_MS = 250; // at least, between pictures with more and more of a scene
 const CERTAIN = 0.2; // certainty from which on a surface is called determined by the recording
 const LONGEST_MS = 2500; // of a picture at rest: what would take longer, without a graphics card say, is drawn smaller
 const MOST_PIXELS = 2560 * 1440;
@@ -29,12 +31,16 @@ export class App {
     this.last = { area: [0, 0, 1, 1], view: null };
     this.listeners = new Set();
     this.ready = false;
+    this.fresh = false; // chunks have come that were not drawn
+    this.drawnAt = 0;
+    this.drawMs = 0;
   }
 
-  /** Unpacks everything; `progress` gets a share between 0 and 1. */
+  /** Brings the log and a coarse picture, starts, and goes on with the rest; `progress` gets a share between 0 and 1. */
   async load(progress) {
     const { facts } = this;
-    const log = sectionsOf(await inflate(await bytesOf("log", facts.log.url)), facts.log.directory);
+    const log = sectionsOf(await inflate(await bytesOf(facts.log.file)), facts.log.directory);
+    progress(0.3);
     this.drive = new Drive(facts, log);
     this.cameras = new Cameras(this.drive, this.state);
     const tracks = facts.tracks.map((track) => ({ ...track, pose: new PoseKeys(log.keys.subarray(8 * track.keys[0], 8 * (track.keys[0] + track.keys[1]))) }));
@@ -45,20 +51,34 @@ export class App {
     });
     this.tracks = tracks;
     this.ground = log.ground ?? null; // levels of heights
-    for (const [k, scene] of facts.scenes.entries()) {
-      const bytes = await bytesOf(`scene-${k}`, scene.url, (share) => progress((k + 0.8 * share) / facts.scenes.length));
-      const found = new SplatScene(scene, sectionsOf(await inflate(bytes), scene.directory));
-      this.loaded.push(this.renderer.load(found));
+    for (const scene of facts.scenes) {
+      const sections = sectionsOf(await inflate(await bytesOf(scene.file)), scene.directory);
+      this.loaded.push(this.renderer.load(new SplatScene(scene, sections)));
     }
+    progress(0.5);
     for (const node of this.loaded[0].scene.nodes) { // boxes as the fit corrected them
       const track = tracks.find((one) => one.id === node.name);
       if (track && node.pose) track.pose = node.pose;
     }
     this.overlayDrawer = new Overlay(this.overlay, tracks, sweeps, this.drive);
-    this.photographs = await bytesOf("images", facts.images.url).catch(() => new Uint8Array(0));
+    this.arrival = new Arrival(this.renderer, this.loaded, () => this.last.view?.eye ?? this.drive.ego.nearest(this.state.t).position,
+      () => { const { left, right } = this.used(); return [left, right]; });
+    await this.arrival.first();
+    this.photographs = null;
+    this.rest = this.loadRest();
     this.ready = true;
     progress(1);
     this.start();
+  }
+
+  /** The recorded images, and all further chunks, which are shown as they come. */
+  async loadRest() {
+    this.arrival.listeners.add(() => { this.fresh = true; });
+    if (this.facts.images.count) {
+      bytesOf(this.facts.images.file).then((bytes) => { this.photographs = bytes; this.change(); },
+        (error) => { document.getElementById("note").textContent = `No recorded images: ${error.message}`; });
+    }
+    await this.arrival.begin();
   }
 
   start() {
@@ -101,6 +121,10 @@ export class App {
     }
     this.move?.(Math.min(0.1, (now - (this.before ?? now)) / 1000));
     this.before = now;
+    if (this.fresh && now - this.drawnAt > Math.max(FRESH_MS, 2 * this.drawMs)) { // more Gaussians, but not at the cost of the controls
+      this.fresh = false;
+      this.again();
+    }
     const resting = now - this.changed > REST_MS && !s.playing;
     if (!this.dirty && (this.sharp || !resting)) return;
     this.draw(resting ? this.restQuality() : this.quality, resting);
@@ -137,6 +161,8 @@ export class App {
     const ms = performance.now() - began;
     if (this.drawnBefore) this.wholeMs[s.layer] = ms / (quality * quality); // the first one also compiles the programs
     this.drawnBefore = true;
+    this.drawnAt = performance.now();
+    this.drawMs = ms;
     if (resting) this.rested();
     else this.quality = clamp(quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
     this.told(ms);
@@ -144,7 +170,7 @@ export class App {
 
   /** Keeps the order of a scene up to date; draws again when a better one is there. */
   ensureOrder(loaded, view) {
-    const key = [this.state.t, ...view.eye, ...view.axes[2], [...this.state.hidden].join(), this.state.edition].join();
+    const key = [loaded.present, this.state.t, ...view.eye, ...view.axes[2], [...this.state.hidden].join(), this.state.edition].join();
     if (loaded.key === key) return;
     loaded.key = key;
     this.renderer.sort(loaded, view, this.state.t, this.state.hidden, (there) => { if (there) this.again(); });
@@ -182,13 +208,13 @@ export class App {
 
   /** An address of a recorded image for <img>; null where the page has none. */
   imageUrl(frame) {
-    if (!frame.image) return null;
+    if (!frame.image || !this.photographs) return null;
     frame.blobUrl ??= URL.createObjectURL(new Blob([this.photographs.subarray(frame.image[0], frame.image[0] + frame.image[1])], { type: "image/webp" }));
     return frame.blobUrl;
   }
 
   image(frame) {
-    if (!frame.image) return null;
+    if (!frame.image || !this.photographs) return null;
     if (!this.images.has(frame.id)) {
       const bytes = this.photographs.subarray(frame.image[0], frame.image[0] + frame.image[1]);
       this.images.set(frame.id, null);
@@ -206,6 +232,7 @@ export class App {
    * @returns {width, height, values: {layer: base64 of floats [height, width, 4], or of bytes for "class"}}
    */
   async measure({ camera, t, shift = 0, width = 0, layers = ["color"], scene = 0, hidden = [] }) {
+    await this.arrival.whole;
     const view = this.cameras.exact(camera, t, shift, 0, width), loaded = this.loaded[scene], without = new Set(hidden), values = {};
     const request = { poses: loaded.scene.placed(t, without).rows, eye: view.eye, ahead: view.axes[2], near: 0.2 };
     let order = null;

@@ -6,11 +6,12 @@ import { scriptText } from "mudg/edits";
 export function exactFrames(app) {
   const { live } = app.facts, badge = document.getElementById("exact");
   if (!live) return;
-  let current = null;
+  let current = null, answered = null; // what is asked for; for which change of the view
   app.onRest = async () => {
     const s = app.state;
-    if (!live.layers.includes(s.layer) || app.editor.wrong) return;
+    if (!live.layers.includes(s.layer) || app.editor.wrong || answered === app.changed) return;
     current?.abort();
+    answered = app.changed;
     current = new AbortController();
     const view = app.last.view, asked = app.changed;
     const body = { scene: s.scene, layer: s.layer, time_s: s.t + app.facts.begin_s, hidden: [...s.hidden], edits: scriptText(s.edits), camera: s.mode === "recorded" ? s.camera : "",
@@ -25,7 +26,9 @@ export function exactFrames(app) {
       app.sharp = true;
       badge.hidden = false;
     } catch (error) {
-      if (error.name !== "AbortError") document.getElementById("note").textContent = `No exact frame: ${error.message}`;
+      if (error.name === "AbortError") return;
+      answered = null;
+      document.getElementById("note").textContent = `No exact frame: ${error.message}`;
     }
   };
   app.listeners.add(() => { badge.hidden = true; });

@@ -11,6 +11,10 @@ const $ = (id) => document.getElementById(id);
 
 async function start() {
   const facts = JSON.parse($("facts").textContent);
+  if (location.protocol === "file:" && !$(facts.log.file.name)) {
+    throw new Error("this page is a folder of files, and a browser reads no files beside a page that it opened from the disk. "
+      + "Serve the folder: python -m http.server --directory FOLDER, then open http://localhost:8000. Or show the run itself: mudg view RUN.");
+  }
   const app = new App(facts, { canvas: $("canvas"), overlay: $("overlay"), stage: $("stage") });
   await app.load((share) => { $("progress").value = share; });
   app.editor = new Editor(app);
@@ -25,7 +29,9 @@ async function start() {
 start().catch((error) => {
   $("loading").hidden = false;
   $("progress").hidden = true;
-  $("problem").textContent = `The scene cannot be shown: ${error.message} The videos of the report need no graphics card.`;
+  $("problem").textContent = `The scene cannot be shown: ${error.message.replace(/\.$/, "")}. The videos of the report need no graphics card.`;
+  $("reload").hidden = false;
+  $("reload").onclick = () => location.reload();
   document.documentElement.dataset.problem = error.message;
   throw error;
 });

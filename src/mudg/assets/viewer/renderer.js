@@ -16,7 +16,7 @@ class Loaded {
     this.scene = scene;
     this.programs = programs;
     this.sorter = new Sorter(scene);
-    this.order = null;
+    this.present = 0; // Gaussians that have come
     this.drawn = 0;
     this.buffer = gl.createBuffer();
   }
@@ -101,22 +101,27 @@ export class Renderer {
     return made;
   }
 
-  bind(unit, texture) {
+  bind(unit, texture, kind = this.gl.TEXTURE_2D) {
     this.gl.activeTexture(this.gl.TEXTURE0 + unit);
-    this.gl.bindTexture(this.gl.TEXTURE_2D, texture);
+    this.gl.bindTexture(kind, texture);
   }
 
-  /** Puts a scene on the card. Its texture words are freed. */
+  /** Makes room for a scene on the card; its Gaussians come with `add`. */
   load(scene) {
     const gl = this.gl, { degree, classes } = scene.facts;
-    const vertex = shaders.splatVertex(degree, scene.texels, TEXTURE_WIDTH);
+    const vertex = shaders.splatVertex(degree, scene.texels, TEXTURE_WIDTH, scene.chunkRows);
     const loaded = new Loaded(gl, scene, {
       sums: this.program(vertex, shaders.splatFragment),
       votes: classes.length > 1 ? this.program(vertex, shaders.voteFragment) : null,
       classes: classes.length > 1 ? this.program(shaders.screenVertex, shaders.classFragment(classes.length)) : null,
     });
-    loaded.data = this.texture(gl.RGBA32UI, TEXTURE_WIDTH, scene.textureHeight, gl.RGBA_INTEGER, gl.UNSIGNED_INT, scene.words);
-    scene.words = null;
+    const layers = Math.max(1, scene.facts.chunks.length);
+    loaded.data = gl.createTexture(); // a layer per chunk: no graphics card has a texture of three million Gaussians in one piece
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, loaded.data);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA32UI, TEXTURE_WIDTH, Math.max(1, scene.layerHeight), layers);
+    if (gl.getError() !== gl.NO_ERROR) throw new Error(`The graphics card has no memory for ${scene.rows.toLocaleString("en")} Gaussians (${Math.round(layers * scene.layerHeight * TEXTURE_WIDTH * 16 / 1e6)} MB). mudg page --budget makes a smaller page.`);
+    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     if (scene.sky) {
       const rows = scene.sky.rows;
       gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -131,6 +136,14 @@ export class Renderer {
     gl.vertexAttribDivisor(0, 1);
     gl.bindVertexArray(null);
     return loaded;
+  }
+
+  /** Puts a chunk on the card. @param words see `unpacked`. @param rows Gaussians in it. */
+  add(loaded, layer, words, rows) {
+    const gl = this.gl;
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, loaded.data);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, TEXTURE_WIDTH, words.length / 4 / TEXTURE_WIDTH, 1, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
+    loaded.present += rows;
   }
 
   // ---- order ----
@@ -171,7 +184,7 @@ export class Renderer {
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(program);
-    this.bind(0, loaded.data);
+    this.bind(0, loaded.data, gl.TEXTURE_2D_ARRAY);
     this.bind(1, this.nodes);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 6, placed.rows.length / 24, 0, gl.RGBA, gl.FLOAT, placed.rows);
     this.filtered(gl.NEAREST);

@@ -7,18 +7,18 @@ export const LAYERS = ["color", "depth", "class", "instance", "normal", "confide
 export const CLASSES_PER_PASS = 12;
 
 const HEAD = `#version 300 es
-precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
+precision highp float; precision highp int; precision highp usampler2DArray; precision highp sampler2D;
 `;
 
-/** Four corners per Gaussian. 'degree': of the spherical harmonics; 'texels': of the data texture per Gaussian. */
-export const splatVertex = (degree, texels, width) => HEAD + `
-uniform usampler2D data; uniform sampler2D nodes, grids;
+/** Four corners per Gaussian. 'degree': of the spherical harmonics; 'texels': of the data texture per Gaussian; 'rows': per layer of it. */
+export const splatVertex = (degree, texels, width, rows) => HEAD + `
+uniform usampler2DArray data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
 uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
-uvec4 word(int k) { int at = int(row) * ${texels} + k; return texelFetch(data, ivec2(at % ${width}, at / ${width}), 0); }
+uvec4 word(int k) { int at = int(row) % ${rows} * ${texels} + k; return texelFetch(data, ivec3(at % ${width}, at / ${width}, int(row) / ${rows}), 0); }
 
 mat3 turned(uint code) { // smallest three, w x y z
   vec3 small = (vec3(code & 1023u, (code >> 10) & 1023u, (code >> 20) & 1023u) - 512.0) / (511.0 * 1.41421356);

@@ -1,8 +1,12 @@
-// Sorts all Gaussians of a scene, static and moving together, far to near, in a worker: the page never waits for it.
+// Unpacks the chunks of a scene and sorts all Gaussians that are there, static and moving together, far to near, in a worker: the page
+// never waits for it.
 
-/** The worker's program. It is turned into text, so it may use nothing from outside. */
+import { TEXTURE_WIDTH, unpacked } from "mudg/data";
+
+/** The worker's program. It is turned into text, so it uses nothing from outside but `unpacked`, which is put before it. */
 function program() {
-  let means, nodeOf, count, keys, rows, keysThen, rowsThen;
+  const chunks = []; // {first, means, nodeOf}
+  let keys, rows, keysThen, rowsThen;
   const histogram = new Uint32Array(65536);
   const bits = new Float32Array(1), asInteger = new Uint32Array(bits.buffer);
 
@@ -19,14 +23,17 @@ function program() {
   }
 
   onmessage = ({ data }) => {
-    if (data.means) {
-      ({ means, nodeOf } = data);
-      count = nodeOf.length;
-      keys = new Uint32Array(count); rows = new Uint32Array(count);
-      keysThen = new Uint32Array(count); rowsThen = new Uint32Array(count);
+    const began = performance.now();
+    if (data.capacity !== undefined) {
+      [keys, rows, keysThen, rowsThen] = Array.from({ length: 4 }, () => new Uint32Array(data.capacity));
       return;
     }
-    const began = performance.now();
+    if (data.chunk) {
+      const { first, count, sections, texels, width, id } = data.chunk, { words, means, nodeOf } = unpacked(sections, count, texels, width);
+      chunks.push({ first, means, nodeOf });
+      postMessage({ id, words, ms: performance.now() - began }, [words.buffer]);
+      return;
+    }
     const { poses, eye, ahead, near, id } = data;
     // depth = ahead . (R m + p - eye): one row of four numbers per node
     const nodes = poses.length / 24, plane = new Float64Array(4 * nodes), shown = new Uint8Array(nodes);
@@ -37,14 +44,16 @@ function program() {
       plane[4 * k + 3] -= ahead[0] * eye[0] + ahead[1] * eye[1] + ahead[2] * eye[2];
     }
     let n = 0;
-    for (let i = 0; i < count; i++) {
-      const k = nodeOf[i];
-      if (!shown[k]) continue;
-      const depth = plane[4 * k] * means[3 * i] + plane[4 * k + 1] * means[3 * i + 1] + plane[4 * k + 2] * means[3 * i + 2] + plane[4 * k + 3];
-      if (depth < near - 0.5) continue; // what a grid displaces may still come before the camera
-      bits[0] = depth > 0 ? depth : 0;
-      keys[n] = asInteger[0]; // positive floats are ordered like their bits
-      rows[n++] = i;
+    for (const { first, means, nodeOf } of chunks) {
+      for (let i = 0, count = nodeOf.length; i < count; i++) {
+        const k = nodeOf[i];
+        if (!shown[k]) continue;
+        const depth = plane[4 * k] * means[3 * i] + plane[4 * k + 1] * means[3 * i + 1] + plane[4 * k + 2] * means[3 * i + 2] + plane[4 * k + 3];
+        if (depth < near - 0.5) continue; // what a grid displaces may still come before the camera
+        bits[0] = depth > 0 ? depth : 0;
+        keys[n] = asInteger[0]; // positive floats are ordered like their bits
+        rows[n++] = first + i;
+      }
     }
     pass(n, 0, keys, rows, keysThen, rowsThen);
     pass(n, 16, keysThen, rowsThen, keys, rows);
@@ -56,22 +65,42 @@ function program() {
 /** Sorts one scene; a request that comes while another is under way waits, and only the latest one is kept. */
 export class Sorter {
   constructor(scene) {
-    const text = URL.createObjectURL(new Blob([`(${program})()`], { type: "text/javascript" }));
+    const text = URL.createObjectURL(new Blob([`const unpacked = ${unpacked};\n(${program})()`], { type: "text/javascript" }));
     this.worker = new Worker(text);
     URL.revokeObjectURL(text);
-    this.worker.postMessage({ means: scene.means, nodeOf: scene.nodeOf }, [scene.means.buffer, scene.nodeOf.buffer]);
-    scene.means = scene.nodeOf = null;
+    this.worker.postMessage({ capacity: scene.rows });
     this.busy = false;
     this.waiting = null;
     this.id = 0;
     this.ms = 0;
+    this.unpacking = new Map(); // id -> {resolve, reject}
+    this.unpackMs = 0;
     this.worker.onmessage = ({ data }) => {
+      if (data.words) {
+        this.unpackMs = data.ms;
+        this.unpacking.get(data.id).resolve(data.words);
+        this.unpacking.delete(data.id);
+        return;
+      }
       this.ms = data.ms;
       this.busy = false;
       const done = this.done;
       this.begin();
       done(data.order);
     };
+    this.worker.onerror = (event) => { // out of memory, say: what was asked for never comes
+      for (const { reject } of this.unpacking.values()) reject(new Error(event.message));
+      this.unpacking.clear();
+    };
+  }
+
+  /** Adds a chunk to what is sorted; its words for the data texture, as a promise. @param first row of the chunk. */
+  unpack(first, count, buffer, sections, texels) {
+    const id = ++this.id;
+    return new Promise((resolve, reject) => {
+      this.unpacking.set(id, { resolve, reject });
+      this.worker.postMessage({ chunk: { first, count, sections, texels, width: TEXTURE_WIDTH, id } }, [buffer]);
+    });
   }
 
   begin() {

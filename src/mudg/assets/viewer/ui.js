@@ -62,15 +62,32 @@ export class Controls {
     this.buttons();
     app.listeners.add(() => this.show());
     app.stats = (ms, quality) => { $("stats").textContent = `${app.used().left.drawn.toLocaleString("en")} Gaussians, ${ms.toFixed(0)} ms${quality < 0.99 ? `, ${Math.round(quality * 100)} % size` : ""}`; };
+    this.arrival();
     const rest = app.onRest;
     app.onRest = () => { rest?.(); this.seen(); };
     this.show();
   }
 
+  /** The line that says how much of the scene is there. */
+  arrival() {
+    const { arrival } = this.app, tell = () => {
+      $("arrival").hidden = arrival.state() === "whole";
+      $("arrival-text").setAttribute("aria-live", arrival.state() === "failed" ? "polite" : "off");
+      $("arrival-text").textContent = arrival.text();
+      $("arrival-share").hidden = arrival.state() === "failed";
+      $("arrival-share").value = arrival.haveBytes / Math.max(1, arrival.bytes);
+      $("arrival-again").hidden = arrival.state() !== "failed";
+      document.documentElement.dataset.arrival = arrival.state();
+    };
+    $("arrival-again").onclick = () => arrival.again();
+    arrival.listeners.add(tell);
+    tell();
+  }
+
   has(layer) {
     const { facts } = this.app, scene = facts.scenes[0];
     if (layer === "class") return scene.classes.length > 1;
-    if (layer === "confidence") return "certainty" in scene.directory;
+    if (layer === "confidence") return scene.certainty;
     return layer !== "recorded" || facts.images.count > 0;
   }
 

@@ -1,6 +1,6 @@
-"""A fitted scene as few bytes as a browser needs to draw it: quantised per block of neighbours, laid out as planes, one blob.
+"""A fitted scene as few bytes as a browser needs to draw it: quantised per block of neighbours, laid out as planes, a blob per chunk.
 
-Rows are ordered by node, within a node along a Morton curve, and cut into blocks of at most `BLOCK` rows. Sections of the blob
+``chunks.py`` says which rows a chunk holds. Its rows are cut into blocks of at most `BLOCK` rows of one node. Sections of its blob
 (little-endian; every one starts at a multiple of 4; n rows, b blocks):
 
     block     f32[b, 12]   least position [3], step [3]; least natural logarithm of the scale [3], step [3]
@@ -13,6 +13,9 @@ Rows are ordered by node, within a node along a Morton curve, and cut into block
     class     u8[2, n]     channel of the likeliest class (255: none), and its lead over the second in `LEAD_STEP`
     certainty u8[n]        of 255 (only if it was measured)
     harmonics u8[3 (K - 1), n]   further bands, (value - 128) * ``harmonic_step`` (only above degree 0)
+
+and of the blob that belongs to all chunks:
+
     sky       u8[rows, 2 rows, 3]   panorama between 0 and 1 (only if there is one)
     keys, deform: see ``motion_sections``
 """
@@ -24,6 +27,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mudg.base import geometry
@@ -33,6 +37,7 @@ from mudg.models.scene.hexplane import HexPlaneNode
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import DeformableNode, RigidNode
 from mudg.models.scene.vibration import VibrationNode
+from mudg.report.viewer.chunks import CHUNK, Layout, lay_out, level_of, opacity_of
 
 BLOCK: Final = 256
 LEAD_STEP: Final = 0.1
@@ -40,8 +45,7 @@ LEAD_STEP: Final = 0.1
 PLACE_STEP_M: Final = 0.0005
 SCALE_STEP: Final = 0.01
 """Finest steps of places, metres, and of logarithms of scales."""
-ALPHA_MIN: Final = 1 / 255
-"""The rasterizer draws no Gaussian below it."""
+SAMPLE: Final = 100_000
 SH_BAND_0: Final = 0.28209479177387814
 COLOR_LIMITS: Final = (-0.5, 2.0)
 """Colours of Gaussians beyond these are cut; a Gaussian may be darker than black or brighter than white where others cover it."""
@@ -51,60 +55,81 @@ Sections = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """A scene for the page.
+    """A scene for the page; its chunks are made one at a time.
 
     Args:
-        sections: see the module's docstring. facts: JSON values that describe them.
-        given: Gaussians of the fit. kept: of the page.
+        model: the scene, on the CPU. layout: which Gaussians of it are on the page.
+        sections: what belongs to all chunks, see the module's docstring. facts: JSON values that describe everything.
         notes: sentences about what the page shows differently from the rasterizer.
     """
 
+    model: SceneModel
+    layout: Layout
     sections: Sections
     facts: dict[str, Any]
-    given: int
-    kept: int
     notes: tuple[str, ...]
 
+    @property
+    def kept(self) -> int:
+        """Gaussians on the page."""
+        return len(self.layout.rows)
 
-def pack_scene(model: SceneModel, begin_s: float, path: NDArray[np.floating] | None = None, most: int = 0) -> Packed:
-    """Quantise a fitted scene.
+    def chunk(self, index: int) -> tuple[Sections, dict[str, Any]]:
+        """Sections of a chunk, and its record: rows, level, box of what stands still (None: nothing does), whether something moves."""
+        rows, columns, facts = self.layout.chunk(index), _columns(self.model), self.facts
+        node = self.model.table.labels["node"].numpy()[rows].astype(np.int64)
+        blocks = list(_blocks(node))
+        sections = _geometry(columns, rows, blocks) | {
+            "block_of": np.array([(n, len(b)) for n, b in blocks], np.uint32)
+        }
+        sections["color"] = _colors(columns, rows, facts["color_low"], facts["color_high"])
+        sections["class"] = _classes(columns.get("semantics"), rows)
+        if self.model.certainty is not None:
+            sections["certainty"] = to_u8(self.model.certainty[torch.from_numpy(rows)].float().numpy())
+        if self.model.sh_degree:
+            sections["harmonics"] = _harmonics(columns["sh_rest"][rows], facts["harmonic_step"])
+        still = columns["means"][rows[node == 0]]
+        box = [[round(float(v), 3) for v in corner] for corner in (still.min(0), still.max(0))] if len(still) else None
+        return sections, {"rows": len(rows), "level": level_of(index), "box": box, "moves": bool((node != 0).any())}
+
+
+def pack_scene(
+    model: SceneModel, begin_s: float, path: NDArray[np.floating] | None = None, most: int = 0, chunk_rows: int = CHUNK
+) -> Packed:
+    """Prepare a fitted scene for the page.
 
     Args:
         model: on the CPU. begin_s: time that becomes 0 in all sections, seconds.
         path: positions of the cameras f64[m, 3]; which Gaussians are worth keeping depends on how near they are.
-        most: number of Gaussians to keep (0 = all that can be drawn).
+        most: number of Gaussians to keep (0 = all that can be drawn). chunk_rows: Gaussians per chunk.
+
+    Raises:
+        UsageError: more Gaussians than a page can hold.
     """
-    columns = {name: value.detach().float().numpy() for name, value in model.table.columns.items()}
-    node = model.table.labels["node"].numpy().astype(np.int64)
-    opacity = 1 / (1 + np.exp(-columns["logits"].astype(np.float64)))
-    rows = np.flatnonzero(opacity >= ALPHA_MIN)
-    if most and len(rows) > most:
-        worth = _worth(columns, opacity, node, path)[rows]
-        rows = np.sort(rows[np.argsort(-worth, kind="stable")[:most]])
-    rows = rows[np.lexsort((morton_codes(columns["means"][rows], node[rows]), node[rows]))]
-    blocks = list(_blocks(node[rows]))
+    columns = _columns(model)
+    layout = lay_out(columns, model.table.labels["node"].numpy(), path, most, chunk_rows)
+    low, high = _color_range(columns["sh_dc"], layout, model.sh_degree)
+    nodes, moving = motion_sections(model, begin_s)
     facts: dict[str, Any] = {
-        "rows": len(rows),
-        "degree": model.sh_degree,
-        "classes": list(model.classes),
-        "lead_step": LEAD_STEP,
-    }
-    sections = _geometry(columns, rows, blocks) | {"block_of": np.array([(n, len(b)) for n, b in blocks], np.uint32)}
-    low, high, sections["color"] = _colors(columns["sh_dc"][rows, 0], opacity[rows], model.sh_degree)
-    facts |= {"color_low": low, "color_high": high}
-    sections["class"] = _classes(columns.get("semantics"), rows)
-    if model.certainty is not None:
-        sections["certainty"] = to_u8(model.certainty.float().numpy()[rows])
+        "rows": len(layout.rows), "chunk_rows": layout.size, "degree": model.sh_degree, "classes": list(model.classes),
+        "lead_step": LEAD_STEP, "color_low": low, "color_high": high, "certainty": model.certainty is not None,
+        "antialias": bool(_drawing(model).get("antialias", False)), "nodes": nodes,
+    }  # fmt: skip
     if model.sh_degree:
-        facts["harmonic_step"], sections["harmonics"] = _harmonics(columns["sh_rest"][rows])
-        facts["harmonics_in_world"] = model.harmonics_in_world
+        facts |= {
+            "harmonic_step": _harmonic_step(columns["sh_rest"], layout),
+            "harmonics_in_world": model.harmonics_in_world,
+        }
     if model.sky is not None:
         panorama = model.sky.table["panorama"].detach()[0].numpy()
-        sections["sky"] = to_u8(panorama.transpose(1, 2, 0))
+        moving["sky"] = to_u8(panorama.transpose(1, 2, 0))
         facts["sky_rows"] = model.sky.rows
-    facts["antialias"] = bool(_drawing(model).get("antialias", False))
-    facts["nodes"], moving = motion_sections(model, begin_s)
-    return Packed(sections | moving, facts, len(node), len(rows), _notes(model))
+    return Packed(model, layout, moving, facts, _notes(model))
+
+
+def _columns(model: SceneModel) -> dict[str, NDArray[Any]]:
+    """The table's columns, without copies."""
+    return {name: value.detach().float().numpy() for name, value in model.table.columns.items()}
 
 
 def _drawing(model: SceneModel) -> Mapping[str, Any]:
@@ -115,37 +140,12 @@ def _drawing(model: SceneModel) -> Mapping[str, Any]:
 def _notes(model: SceneModel) -> tuple[str, ...]:
     notes = []
     if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
-        notes.append("Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them.")
+        notes.append(
+            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them."
+        )
     if set(_drawing(model)) - {"antialias", "packed"}:
         notes.append("This scene was fitted to be drawn along rays or as discs. The page draws the usual ellipsoids.")
     return tuple(notes)
-
-
-def _worth(columns: Mapping[str, Any], opacity: Any, node: Any, path: Any) -> NDArray[np.float64]:
-    """Opacity times the area that a Gaussian covers in an image taken where the path is nearest. What moves counts as 10 m away."""
-    two = np.sort(columns["log_scales"], 1)[:, 1:].sum(1).astype(np.float64)
-    distance2 = np.full(len(two), 100.0)
-    if path is not None and len(path):
-        from scipy.spatial import cKDTree
-
-        still = node == 0
-        distance2[still] = cKDTree(path).query(columns["means"][still])[0] ** 2
-    return opacity * np.exp(two) / np.maximum(distance2, 1.0)
-
-
-def morton_codes(means: NDArray[np.floating], node: NDArray[np.integer]) -> NDArray[np.uint64]:
-    """Places along a space-filling curve through each node's own box: u64[n], 16 bits per axis."""
-    codes = np.zeros(len(means), np.uint64)
-    for one in np.unique(node):
-        here = node == one
-        low, high = means[here].min(0), means[here].max(0)
-        cell = ((means[here] - low) / np.maximum(high - low, 1e-9) * 65535).astype(np.uint64)
-        mixed = np.zeros(len(cell), np.uint64)
-        for bit in range(16):
-            for axis in range(3):
-                mixed |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-        codes[here] = mixed
-    return codes
 
 
 def _blocks(node: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
@@ -191,14 +191,18 @@ def smallest_three(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     return level[:, 0] | level[:, 1] << 10 | level[:, 2] << 20 | largest.astype(np.uint32) << 30
 
 
-def _colors(bands: Any, opacity: Any, degree: int) -> tuple[float, float, NDArray[np.uint8]]:
-    rgb = bands * SH_BAND_0 + 0.5
-    low = (
-        max(float(rgb.min(initial=0)), COLOR_LIMITS[0]) if degree else 0.0
-    )  # without further bands what is below 0 is drawn as 0
-    high = min(max(float(rgb.max(initial=1)), 1.0), COLOR_LIMITS[1])
-    level = to_u8((rgb - low) / (high - low))
-    return low, high, np.concatenate([level.T, to_u8(opacity)[None]])
+def _color_range(bands: Any, layout: Layout, degree: int) -> tuple[float, float]:
+    """Between which colours the page tells levels apart. Without further bands what is below 0 is drawn as 0."""
+    low, high = 0.0, 1.0
+    for index in range(len(layout)):
+        rgb = bands[layout.chunk(index), 0] * SH_BAND_0 + 0.5
+        low, high = min(low, float(rgb.min())), max(high, float(rgb.max()))
+    return max(low, COLOR_LIMITS[0]) if degree else 0.0, min(high, COLOR_LIMITS[1])
+
+
+def _colors(columns: Mapping[str, Any], rows: Any, low: float, high: float) -> NDArray[np.uint8]:
+    rgb = columns["sh_dc"][rows, 0] * SH_BAND_0 + 0.5
+    return np.concatenate([to_u8((rgb - low) / (high - low)).T, to_u8(opacity_of(columns["logits"][rows]))[None]])
 
 
 def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
@@ -210,10 +214,14 @@ def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
     return np.stack([here.argmax(1), lead]).astype(np.uint8)
 
 
-def _harmonics(rest: Any) -> tuple[float, NDArray[np.uint8]]:
-    flat = rest.reshape(len(rest), -1)
-    step = max(float(np.percentile(np.abs(flat), 99.95)) if flat.size else 0.0, 1e-6) / 127
-    return step, (np.clip(np.rint(flat / step), -127, 127) + 128).astype(np.uint8).T.copy()
+def _harmonic_step(rest: Any, layout: Layout) -> float:
+    """Step of the levels: nearly all values lie within 127 of them. Taken from at most `SAMPLE` rows, evenly."""
+    some = rest[layout.rows[:: max(1, -(-len(layout.rows) // SAMPLE))]]
+    return max(float(np.percentile(np.abs(some), 99.95)) if some.size else 0.0, 1e-6) / 127
+
+
+def _harmonics(rest: Any, step: float) -> NDArray[np.uint8]:
+    return (np.clip(np.rint(rest.reshape(len(rest), -1) / step), -127, 127) + 128).astype(np.uint8).T.copy()
 
 
 def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:

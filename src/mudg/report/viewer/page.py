@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Final
@@ -15,14 +15,40 @@ from markupsafe import Markup
 from mudg.base import store
 from mudg.report import html
 from mudg.report.viewer.facts import PageFacts
-from mudg.report.viewer.packed import Packed, blob_of
+from mudg.report.viewer.packed import Packed, Sections, blob_of
 
 ONE_FILE_BYTES: Final = 32 * 2**20
 """A page larger than this becomes a folder: not every browser opens larger ones."""
+TEXELS: Final = (2, 3, 4, 5)
+"""Texels per Gaussian by degree of the harmonics; as `assets/viewer/data.js` lays them out."""
+SORT_BYTES: Final = 38
+"""Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 MODULES: Final = (
-    "math", "data", "sorter", "shaders", "renderer", "cameras", "state", "overlay", "edits", "app", "share", "gizmo", "editor",
+    "math", "data", "sorter", "shaders", "renderer", "cameras", "state", "overlay", "edits", "arrival", "app", "share", "gizmo", "editor",
     "ui", "input", "exact", "main",
 )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class PageFile:
+    """One data file of a page, gzipped where that helps.
+
+    Args:
+        name: of the element that holds it in a page of one file. content: bytes.
+    """
+
+    name: str
+    content: bytes
+
+    @property
+    def url(self) -> str:
+        """Name of the file beside the page. It changes with the content: no store of old answers can mix two pages."""
+        return f"{self.name}-{hashlib.sha256(self.content).hexdigest()[:8]}.bin"
+
+    def record(self) -> dict[str, Any]:
+        """How the page finds and checks the file."""
+        digest = base64.b64encode(hashlib.sha256(self.content).digest()).decode()
+        return {"name": self.name, "url": self.url, "bytes": len(self.content), "sha256": digest}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +59,7 @@ class ViewerPage:
         title, subtitle, about: texts. report: relative address of the report, or empty.
         scenes: (name, scene), the one that is shown first; at most two.
         log: everything else. live: settings of a server behind the page, or None.
+        effort: of gzip, 1 to 9.
     """
 
     title: str
@@ -42,36 +69,53 @@ class ViewerPage:
     scenes: Sequence[tuple[str, Packed]]
     log: PageFacts
     live: Mapping[str, Any] | None = None
+    effort: int = 9
 
-    def build(self) -> tuple[dict[str, bytes], dict[str, Any]]:
-        """The data files by name, gzipped where that helps, and the facts that name them."""
-        data, facts = {}, dict(self.log.facts)
-        blob, directory = blob_of(self.log.sections)
-        data["log"] = _gzipped(blob)
-        facts |= {
-            "log": {"directory": directory, "url": "log.bin"},
-            "images": facts["images"] | {"url": "images.bin"},
-            "scenes": [],
-        }
-        facts["live"] = None if self.live is None else dict(self.live)
+    def files(self, facts: dict[str, Any]) -> Iterator[PageFile]:
+        """The data files, made one at a time; `facts` becomes what the page says about them and is complete after the last one."""
+        facts |= self.log.facts | {"live": None if self.live is None else dict(self.live), "scenes": []}
+        made = PageFile("images", self.log.images)
+        facts["images"] = facts["images"] | {"file": made.record()}
+        yield made
+        made, facts["log"] = self._file("log", self.log.sections)
+        yield made
         for index, (name, packed) in enumerate(self.scenes):
-            blob, directory = blob_of(packed.sections)
-            data[f"scene-{index}"] = _gzipped(blob)
-            facts["scenes"].append({"name": name, "directory": directory, "url": f"scene-{index}.bin", **packed.facts})
-        data["images"] = self.log.images
-        return data, facts
+            made, record = self._file(f"scene-{index}", packed.sections)
+            scene = {"name": name, **packed.facts, **record, "chunks": []}
+            facts["scenes"].append(scene)
+            yield made
+            for number in range(len(packed.layout)):
+                sections, about = packed.chunk(number)
+                made, record = self._file(f"scene-{index}-{number:03d}", sections)
+                scene["chunks"].append(record | about)
+                yield made
 
-    def one_file(self, data: Mapping[str, bytes], facts: Mapping[str, Any]) -> bytes:
+    def _file(self, name: str, sections: Sections) -> tuple[PageFile, dict[str, Any]]:
+        blob, directory = blob_of(sections)
+        made = PageFile(name, gzip.compress(blob, self.effort, mtime=0))
+        return made, {"file": made.record(), "directory": directory}
+
+    def chunks(self) -> int:
+        """Chunks of all scenes."""
+        return sum(len(packed.layout) for _, packed in self.scenes)
+
+    def graphics_bytes(self) -> int:
+        """What the scenes take on the graphics card: texels of 16 bytes, and the order, 4 bytes per Gaussian."""
+        return sum(
+            16 * TEXELS[p.facts["degree"]] * len(p.layout) * min(p.layout.size, p.kept) + 4 * p.kept for _, p in self.scenes
+        )  # fmt: skip
+
+    def heap_bytes(self) -> int:
+        """What a browser keeps of the scenes to sort them: places, nodes, keys and rows twice, two orders."""
+        return sum(SORT_BYTES * packed.kept for _, packed in self.scenes)
+
+    def one_file(self, files: Iterable[PageFile], facts: Mapping[str, Any]) -> bytes:
         """The page with all data in it."""
-        inside = [(name, base64.b64encode(content).decode()) for name, content in data.items()]
-        return self._html(inside, facts, sum(map(len, data.values())))
+        inside = [(file.name, base64.b64encode(file.content).decode()) for file in files]
+        return self.html(facts, sum(3 * len(text) // 4 for _, text in inside), inside)
 
-    def folder(self, data: Mapping[str, bytes], facts: Mapping[str, Any]) -> dict[str, bytes]:
-        """The page and its data as files."""
-        pages = {"index.html": self._html([], facts, sum(map(len, data.values())))}
-        return pages | {f"{name}.bin": content for name, content in data.items()}
-
-    def _html(self, inside: Sequence[tuple[str, str]], facts: Mapping[str, Any], size: int) -> bytes:
+    def html(self, facts: Mapping[str, Any], size: int, inside: Sequence[tuple[str, str]] = ()) -> bytes:
+        """The page. size: bytes of all data. inside: (name, base64) of the data that stand in it."""
         near, far = facts["depth_range_m"]
         imports, entry = import_map(), 'import "mudg/main";'
         text = html.render(
@@ -82,10 +126,6 @@ class ViewerPage:
             payloads=inside, facts=Markup(script_json(facts)), entry=Markup(entry),  # noqa: S704
         )  # fmt: skip
         return text.encode()
-
-
-def _gzipped(blob: bytes) -> bytes:
-    return gzip.compress(blob, 9, mtime=0)
 
 
 def asset(name: str) -> str:

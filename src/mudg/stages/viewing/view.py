@@ -4,8 +4,10 @@ frames where the camera rests. The page is ``assets/viewer``; what it is made of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from http.server import ThreadingHTTPServer
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,9 +23,10 @@ from mudg.core.raster.place import drawing_device
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
+from mudg.report.viewer.chunks import CHUNK
 from mudg.report.viewer.facts import begin_of, log_facts, with_ground
 from mudg.report.viewer.packed import Packed, pack_scene
-from mudg.report.viewer.page import ONE_FILE_BYTES, ViewerPage
+from mudg.report.viewer.page import ONE_FILE_BYTES, PageFile, ViewerPage
 from mudg.stages.config.view import PageConfig, ViewConfig
 from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.runs import RunParts, find_run
@@ -75,28 +78,51 @@ def run_page(
     for path in (out, folder):
         if path.exists() and not overwrite:
             raise UsageError("the output exists", where=str(path), remedy="choose another --out, or add --overwrite")
-    shown = find_shown(config, run, scene, compare)
-    page = page_of(config, shown, report=report)
-    data, facts = page.build()
-    kept = [packed.kept for _, packed in page.scenes]
-    size = sum(map(len, data.values())) * 4 // 3
-    whole = size <= ONE_FILE_BYTES
-    log.info(budget_text(page, data, out if whole else folder / "index.html"))
-    if whole:
-        content = page.one_file(data, facts)
+    _refuse_foreign(folder)
+    page = page_of(config, find_shown(config, run, scene, compare), report=report)
+    facts: dict[str, Any] = {}
+    made, held = page.files(facts), list[PageFile]()
+    for file in made:
+        held.append(file)
+        if sum(len(one.content) for one in held) * 4 // 3 > ONE_FILE_BYTES:
+            path, size = _write_folder(page, folder, chain(held, made), facts, _forecast(page, held))
+            store.remove(out)
+            text = f"page: {path.resolve()} ({size / 1e6:.1f} MB; needs a web server: python -m http.server --directory {folder.name})"
+            break
+    else:
+        content = page.one_file(held, facts)
+        log.info(needs_text(page, out, f"{len(content) / 1e6:.1f} MB"))
         store.atomic_write(out, content)
-        return {
-            "page": out,
-            "bytes": len(content),
-            "gaussians": kept,
-            "text": f"page: {out.resolve()} ({len(content) / 1e6:.1f} MB)",
-        }
-    files = page.folder(data, facts)
-    for name, content in files.items():
-        store.atomic_write(folder / name, content)
-    total = sum(map(len, files.values()))
-    text = f"page: {(folder / 'index.html').resolve()} ({total / 1e6:.1f} MB; needs a web server: mudg view, or python -m http.server)"
-    return {"page": folder / "index.html", "bytes": total, "gaussians": kept, "text": text}
+        path, size, text = out, len(content), f"page: {out.resolve()} ({len(content) / 1e6:.1f} MB)"
+    return {"page": path, "bytes": size, "gaussians": [packed.kept for _, packed in page.scenes], "text": text}
+
+
+def _refuse_foreign(folder: Path) -> None:
+    if folder.exists() and not (folder / "index.html").is_file():
+        raise UsageError("this folder is not a page", where=str(folder), remedy="choose another --out")
+
+
+def _write_folder(
+    page: ViewerPage, folder: Path, files: Iterable[PageFile], facts: dict[str, Any], forecast: int
+) -> tuple[Path, int]:
+    """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of everything."""
+    log.info(needs_text(page, folder / "index.html", f"about {forecast / 1e6:.0f} MB in {page.chunks()} chunks"))
+    size = 0
+    with store.atomic_directory(folder) as place:
+        for file in files:
+            store.write_in_tree(place / file.url, file.content)
+            size += len(file.content)
+        index = page.html(facts, size)
+        store.write_in_tree(place / "index.html", index)
+        store.sync_tree(place)
+    return folder / "index.html", size + len(index)
+
+
+def _forecast(page: ViewerPage, begun: Sequence[PageFile]) -> int:
+    """Bytes of all files, judging by the first ones. Only chunks are many and large."""
+    chunks = [len(file.content) for file in begun if file.name.count("-") == 2]
+    done = sum(len(file.content) for file in begun)
+    return done + (page.chunks() - len(chunks)) * (sum(chunks) // max(1, len(chunks)))
 
 
 def _inside(out: Path, run: Path) -> bool:
@@ -150,7 +176,7 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     """The page of what is shown."""
     scene, begin = shown.scene, begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    packed = [(name, pack_scene(model, begin, path, config.budget)) for name, model in shown.fits]
+    packed = [(name, pack_scene(model, begin, path, config.budget, CHUNK)) for name, model in shown.fits]
     facts = log_facts(scene, shown.fits[0][1].colors, config.image_width_px, config.images, config.lidar_points)
     facts = with_ground(facts, shown.ground())
     first = packed[0][1]
@@ -160,23 +186,33 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     )  # fmt: skip
 
 
-def about_text(scene: Scene, packed: Packed) -> str:
+def about_text(scene: Scene, first: Packed) -> str:
     """A few sentences on the page."""
-    left = packed.given - packed.kept
     return (
-        f"{packed.kept:,} Gaussians{f' of {packed.given:,}' if left else ''}, {len(scene.frames)} recorded frames of "
+        f"{kept_text(first)}, {len(scene.frames)} recorded frames of "
         f"{len(scene.cameras)} cameras, {len(scene.tracks)} tracked objects. Places, sizes and colours are rounded "
-        f"for the page. Data: {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing and sends nothing."
+        f"for the page. Data: {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing from elsewhere "
+        "and sends nothing."
     )
 
 
-def budget_text(page: ViewerPage, data: dict[str, bytes], out: Path) -> str:
-    """What the page will take, before it is written."""
-    parts = [
-        f"{name.replace('scene-', 'scene ')} {len(content) / 1e6:.2f} MB" for name, content in data.items() if content
-    ]
-    counts = [f"{packed.kept:,} of {packed.given:,} Gaussians" for _, packed in page.scenes]
-    return f"page {out}: {'; '.join(counts)}; {', '.join(parts)}"
+def kept_text(packed: Packed) -> str:
+    """How many Gaussians a page shows, and what was left out."""
+    layout = packed.layout
+    faint, cut = layout.given - layout.visible, layout.visible - len(layout.rows)
+    lost = f"{100 * layout.lost:.2g} % of what all cover in the recorded views"
+    parts = [f"{cut:,} left out for the budget, {lost}"] if cut else []
+    parts += [f"{faint:,} too faint to be drawn"] if faint else []
+    return f"{len(layout.rows):,} Gaussians" + (f" of {layout.given:,} ({'; '.join(parts)})" if parts else "")
+
+
+def needs_text(page: ViewerPage, out: Path | str, size: str) -> str:
+    """What a page takes, before it is written or served."""
+    kept = "; ".join(kept_text(packed) for _, packed in page.scenes)
+    return (
+        f"page {out}: {kept}; {size}; in the browser {page.graphics_bytes() / 1e6:.0f} MB of graphics memory and "
+        f"{page.heap_bytes() / 1e6:.0f} MB of memory for sorting"
+    )
 
 
 def run_view(
@@ -216,11 +252,12 @@ def server_of(
     shown = find_shown(config, run, scene, compare)
     layers = list(LAYERS) if config.exact else []
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
-    page = page_of(
-        config, shown, live={"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name}
-    )
-    made = page.folder(*page.build())
-    served = {"" if name == "index.html" else name: content for name, content in made.items()}
+    live = {"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name}
+    page, facts = replace(page_of(config, shown, live=live), effort=1), dict[str, Any]()  # nothing leaves this machine
+    served = {file.url: file.content for file in page.files(facts)}
+    size = sum(map(len, served.values()))
+    served[""] = page.html(facts, size)
+    log.info(needs_text(page, "served", f"{size / 1e6:.1f} MB in {page.chunks()} chunks"))
     report = Path(run) / "report.html"
     if report.is_file():
         served["report.html"] = store.read_bytes(report)
