@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import http.client
+import http.server
 import json
 import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import CHROMIUM, NO_BROWSER, Browser, BrowserError
 from toy_fitted import STREET, toy_fitted, write_toy_run
 
 from mudg.base.errors import InputError, UsageError
@@ -341,6 +344,113 @@ def test_names_from_a_log_do_not_run(opened: Browser, toy: tuple[Path, Path, Sce
     assert opened.run("document.querySelector('h1').textContent") == opened.run("document.title") == name
     assert opened.run("document.documentElement.dataset.foreign === undefined && !document.querySelector('img[src=x]')")
     assert opened.errors == []
+
+
+# a page in chunks -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def web(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    """An ordinary web server: its folder and its address."""
+    root = tmp_path / "web"
+    root.mkdir()
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(root)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield root, f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    one = Browser(tmp_path / "profile", size=(360, 300))
+    try:
+        yield one
+    finally:
+        one.close()
+
+
+AT = {"camera": "front", "t": 0.4, "shift": 1.0}
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_page_in_chunks_shows_what_one_chunk_shows(
+    toy: tuple[Path, Path, SceneModel], web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder_page(toy, web[0], monkeypatch)
+    fresh.open(f"{web[1]}/page_page/#m=recorded&c=front&t=0.4")
+    fresh.wait("document.documentElement.dataset.arrival === 'whole'")
+    chunked = fresh.measure(["color", "depth", "class"], **AT)
+    assert fresh.run("document.getElementById('arrival').hidden")
+    assert len([address for address in fresh.requests if "scene-0-0" in address]) == fresh.run("mudg.arrival.all.length") > 10
+    assert fresh.errors == []
+    # one file whose chunks are the same holds the same picture to the bit
+    config = PageConfig(images=3)
+    inside = view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))
+    (web[0] / "one.html").write_bytes(whole_page(inside))
+    fresh.open(f"file://{web[0] / 'one.html'}")
+    one = fresh.measure(["color", "depth", "class"], **AT)
+    for layer, values in chunked.items():
+        assert np.array_equal(values, one[layer]), layer
+    # one chunk of everything has other blocks: the same within rounding
+    monkeypatch.setattr(view, "CHUNK", 65_536)
+    (web[0] / "one.html").write_bytes(whole_page(view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))))
+    fresh.open(f"file://{web[0] / 'one.html'}")
+    assert psnr(fresh.measure(["color"], **AT)["color"] / 255.0, chunked["color"] / 255.0) > 45
+
+
+@pytest.mark.slow
+@needs_browser
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [("missing", "404"), ("truncated", "of"), ("foreign", "its content is not what this page was made with")],
+)
+def test_a_chunk_that_fails_is_told_and_can_be_tried_again(
+    toy: tuple[Path, Path, SceneModel], web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch, damage: str, told: str
+) -> None:  # fmt: skip
+    folder, facts = folder_page(toy, web[0], monkeypatch)
+    record = facts["scenes"][0]["chunks"][4]["file"]
+    path = folder / record["url"]
+    whole = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    elif damage == "truncated":
+        path.write_bytes(whole[:-20])
+    else:
+        path.write_bytes(gzip.compress(bytes(len(gzip.decompress(whole)))).ljust(len(whole), b"\0")[: len(whole)])
+    fresh.open(f"{web[1]}/page_page/")
+    fresh.wait("document.documentElement.dataset.arrival === 'failed'")
+    text = fresh.run("document.getElementById('arrival-text').textContent")
+    assert record["url"] in text and told in text and "1 of" in text and "not complete" in text
+    assert fresh.run("mudg.loaded[0].present") == facts["scenes"][0]["rows"] - 64
+    fresh.wait(f"mudg.used().left.drawn > 0 && mudg.used().left.drawn <= {facts['scenes'][0]['rows'] - 64}")
+    path.write_bytes(whole)
+    fresh.run("document.getElementById('arrival-again').click()")
+    fresh.wait("document.documentElement.dataset.arrival === 'whole'")
+    assert fresh.run("document.getElementById('arrival').hidden")
+    assert fresh.run("mudg.loaded[0].present") == facts["scenes"][0]["rows"]
+    assert len(fresh.errors) and all("scene-0-004" in error or "integrity" in error for error in fresh.errors), fresh.errors
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_folder_opened_from_the_disk_says_what_to_do(
+    toy: tuple[Path, Path, SceneModel], tmp_path: Path, fresh: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _ = folder_page(toy, tmp_path, monkeypatch)
+    with pytest.raises(BrowserError, match="python -m http.server"):
+        fresh.open(f"file://{folder / 'index.html'}")
+    assert "mudg view RUN" in fresh.run("document.getElementById('problem').textContent")
 
 
 # the server ----------------------------------------------------------------------------------------------------------

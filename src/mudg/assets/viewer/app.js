@@ -13,7 +13,8 @@ const SLOW_MS = 45, QUICK_MS = 18; // of a frame while moving: draw smaller, or 
 const SMALLEST = 0.22;
 const FRESH_MS = 250; // at least, between pictures with more and more of a scene
 const CERTAIN = 0.2; // certainty from which on a surface is called determined by the recording
-const LONGEST_MS = 2500; // of a picture at rest: what would take longer, without a graphics card say, is drawn smaller
+const LONGEST_MS = 2500, LOADING_MS = 300; // of a picture at rest, and while chunks arrive: what would take longer is drawn smaller
+const PROBES = [SMALLEST, 0.4]; // sizes of the first pictures, which tell how long larger ones take
 const MOST_PIXELS = 2560 * 1440;
 
 export class App {
@@ -26,7 +27,7 @@ export class App {
     this.loaded = [];
     this.images = new Map();
     this.quality = 0.3;
-    this.wholeMs = {}; // layer -> milliseconds of a picture at full size, as far as smaller ones tell
+    this.timed = {}; // layer -> the last two pictures of different size: [share of the pixels, milliseconds]
     this.changed = 0;
     this.last = { area: [0, 0, 1, 1], view: null };
     this.listeners = new Set();
@@ -130,8 +131,19 @@ export class App {
     this.draw(resting ? this.restQuality() : this.quality, resting);
   }
 
+  /** How large a picture at rest may be. Its time is a constant, of the Gaussians, and a part that grows with its pixels. */
   restQuality() {
-    return clamp(Math.sqrt(LONGEST_MS / (this.wholeMs[this.state.layer] ?? 1)), SMALLEST, 1);
+    const timed = this.timed[this.state.layer] ?? [];
+    if (timed.length < 2) return PROBES[timed.length && timed[0][0] === PROBES[0] ** 2 ? 1 : 0];
+    const [[p, a], [q, b]] = timed, perPixel = Math.max((b - a) / (q - p), 1e-3), constant = Math.max(0, b - perPixel * q);
+    const longest = this.arrival.state() === "loading" ? LOADING_MS : LONGEST_MS;
+    return clamp(Math.sqrt(Math.max(longest - constant, constant) / perPixel), SMALLEST, 1);
+  }
+
+  /** Notes how long a picture took. */
+  time(quality, ms) {
+    const timed = this.timed[this.state.layer] ??= [], pixels = quality * quality;
+    this.timed[this.state.layer] = [...timed.filter(([share]) => Math.abs(share - pixels) > 0.02), [pixels, ms]].slice(-2);
   }
 
   /** Sizes of canvas and picture in pixels: [canvas width, height, ratio]. */
@@ -159,12 +171,12 @@ export class App {
     this.renderer.present(pictures[0] ?? pictures[1] ?? this.pictureOf("left", left, small, "color"), pictures[1], below, mode, s.divider);
     this.renderer.gl.readPixels(0, 0, 1, 1, this.renderer.gl.RGBA, this.renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits: the time is the true one
     const ms = performance.now() - began;
-    if (this.drawnBefore) this.wholeMs[s.layer] = ms / (quality * quality); // the first one also compiles the programs
+    if (this.drawnBefore) this.time(quality, ms); // the first one also compiles the programs
     this.drawnBefore = true;
     this.drawnAt = performance.now();
     this.drawMs = ms;
-    if (resting) this.rested();
-    else this.quality = clamp(quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
+    if (resting && this.timed[s.layer]?.length === 2) this.rested();
+    else if (!resting) this.quality = clamp(quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
     this.told(ms);
   }
 

@@ -79,13 +79,21 @@ def run_page(
         if path.exists() and not overwrite:
             raise UsageError("the output exists", where=str(path), remedy="choose another --out, or add --overwrite")
     _refuse_foreign(folder)
-    page = page_of(config, find_shown(config, run, scene, compare), report=report)
+    return write_page(page_of(config, find_shown(config, run, scene, compare), report=report), out, folder)
+
+
+def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
+    """Write a page: one file where it is small enough, else a folder. At most `ONE_FILE_BYTES` of it are held at a time.
+
+    Returns:
+        As ``run_page``.
+    """
     facts: dict[str, Any] = {}
     made, held = page.files(facts), list[PageFile]()
     for file in made:
         held.append(file)
         if sum(len(one.content) for one in held) * 4 // 3 > ONE_FILE_BYTES:
-            path, size = _write_folder(page, folder, chain(held, made), facts, _forecast(page, held))
+            path, size = _write_folder(page, folder, held, made, facts)
             store.remove(out)
             text = f"page: {path.resolve()} ({size / 1e6:.1f} MB; needs a web server: python -m http.server --directory {folder.name})"
             break
@@ -103,13 +111,13 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def _write_folder(
-    page: ViewerPage, folder: Path, files: Iterable[PageFile], facts: dict[str, Any], forecast: int
+    page: ViewerPage, folder: Path, begun: list[PageFile], more: Iterable[PageFile], facts: dict[str, Any]
 ) -> tuple[Path, int]:
     """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of everything."""
-    log.info(needs_text(page, folder / "index.html", f"about {forecast / 1e6:.0f} MB in {page.chunks()} chunks"))
+    log.info(needs_text(page, folder / "index.html", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"))
     size = 0
     with store.atomic_directory(folder) as place:
-        for file in files:
+        for file in chain(begun, more):
             store.write_in_tree(place / file.url, file.content)
             size += len(file.content)
         index = page.html(facts, size)
@@ -210,8 +218,8 @@ def needs_text(page: ViewerPage, out: Path | str, size: str) -> str:
     """What a page takes, before it is written or served."""
     kept = "; ".join(kept_text(packed) for _, packed in page.scenes)
     return (
-        f"page {out}: {kept}; {size}; in the browser {page.graphics_bytes() / 1e6:.0f} MB of graphics memory and "
-        f"{page.heap_bytes() / 1e6:.0f} MB of memory for sorting"
+        f"page {out}: {kept}; {size}; in the browser {page.graphics_bytes() / 1e6:.1f} MB of graphics memory and "
+        f"{page.heap_bytes() / 1e6:.1f} MB of memory for sorting"
     )
 
 
