@@ -177,7 +177,24 @@ export class App {
     this.drawMs = ms;
     if (resting && this.timed[s.layer]?.length === 2) this.rested();
     else if (!resting) this.quality = clamp(quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
-    this.told(ms);
+    this.told(ms, quality);
+  }
+
+  /** Changes the state and returns when every scene in use is sorted for it. */
+  async settled(values) {
+    this.change(values);
+    const [width, height, ratio] = this.size(), view = this.cameras.view(width, height), { left, right } = this.used(), { state } = this;
+    for (const one of new Set([left, right])) {
+      if (!one?.sorter) continue;
+      let order = null;
+      while (!order) order = await one.sorter.order(this.renderer.request(one, view, state.t, state.hidden)); // the page may ask in between
+      this.renderer.use(one, order);
+    }
+    const frame = this.drive.nearestFrame(state.camera, state.t);
+    while (frame.image && this.photographs && !this.image(frame)) await new Promise((resolve) => setTimeout(resolve, 10));
+    const area = [Math.round((width - view.width) / 2), Math.round((height - view.height) / 2), view.width, view.height];
+    this.last = { area, view, ratio };
+    this.overlayDrawer.draw(view, area, state, ratio);
   }
 
   /** Keeps the order of a scene up to date; draws again when a better one is there. */
@@ -193,12 +210,12 @@ export class App {
     return this.renderer.picture(name, loaded, view, this.state.t, layer, this.state.hidden);
   }
 
-  told(ms) {
+  told(ms, quality) {
     const data = document.documentElement.dataset;
     data.frameMs = ms.toFixed(1);
     data.drawn = String(this.used().left.drawn);
     if (!data.firstPictureMs) data.firstPictureMs = performance.now().toFixed(0);
-    this.stats?.(ms, this.quality);
+    this.stats?.(ms, quality);
   }
 
   /** What happens when the camera rests: the address is renewed, the exact frame asked for. */
@@ -246,9 +263,8 @@ export class App {
   async measure({ camera, t, shift = 0, width = 0, layers = ["color"], scene = 0, hidden = [] }) {
     await this.arrival.whole;
     const view = this.cameras.exact(camera, t, shift, 0, width), loaded = this.loaded[scene], without = new Set(hidden), values = {};
-    const request = { poses: loaded.scene.placed(t, without).rows, eye: view.eye, ahead: view.axes[2], near: 0.2 };
     let order = null;
-    while (!order) order = await loaded.sorter.order(request); // the page may ask in between
+    while (!order) order = await loaded.sorter.order(this.renderer.request(loaded, view, t, without)); // the page may ask in between
     this.renderer.use(loaded, order);
     for (const layer of layers) {
       const picture = layer === "class" || layer === "color";

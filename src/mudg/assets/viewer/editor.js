@@ -3,9 +3,11 @@
 
 import { Ground, Motion, SHOWN, carriedOut, scriptText, summary, verbOf, withMove } from "mudg/edits";
 import { PoseKeys } from "mudg/math";
+import { LIGHTS, VISIBILITIES_M, conditionsOf, withConditions } from "mudg/weather";
 
 const WAIT_MS = 350;
 const MOST_STEPS = 200;
+const AHEAD_M = 12; // where an inserted object stands
 const FIELDS = { "edit-along": "along_m", "edit-left": "left_m", "edit-yaw": "yaw_deg" };
 const $ = (id) => document.getElementById(id);
 
@@ -79,6 +81,24 @@ export class Editor {
     if (this.can(id)) this.set([...this.app.state.edits, { stop: { id, at_s: Math.round(at * 1000) / 1000 } }]);
   }
 
+  /** Puts another object of this run in the place of one. The server does it: exact frames show it. */
+  replace(id, by) {
+    const { run } = this.app.facts.live ?? {};
+    if (run && by) this.set([...this.app.state.edits, { replace: { id, by: { run, id: by } } }]);
+  }
+
+  /** Puts another one of an object where the vehicle is now, ahead of it. */
+  insert(id) {
+    const { run } = this.app.facts.live ?? {}, at = this.app.state.t + this.app.facts.begin_s;
+    if (run) this.set([...this.app.state.edits, { insert: { asset: { run, id }, near: { id: "ego", at_s: Math.round(at * 1000) / 1000, ahead_m: AHEAD_M } } }]);
+  }
+
+  /** Another visibility or light: an entry of the script, of which the page shows a preview. */
+  conditions(values) {
+    const { edits } = this.app.state, made = withConditions(edits, { ...conditionsOf(edits), ...values });
+    if (scriptText(made) !== scriptText(edits)) this.set(made);
+  }
+
   /** The last entry if it moves this object for good. */
   lastMove(id) {
     const { edits } = this.app.state, [verb, given] = edits.length ? verbOf(edits[edits.length - 1]) : [];
@@ -98,6 +118,7 @@ export class Editor {
     };
     for (const { scene } of app.loaded) for (const node of scene.nodes) if (node.recorded) path(node, node.name);
     for (const track of app.tracks) path(track, track.id);
+    app.renderer.conditions = conditionsOf(edits);
   }
 
   /** Has the server check the entries, and takes from it what the page cannot compute. */
@@ -105,7 +126,7 @@ export class Editor {
     clearTimeout(this.timer);
     const { live } = this.app.facts, { edits } = this.app.state;
     this.problem("");
-    $("edit-notes").textContent = live || edits.every((entry) => SHOWN.includes(verbOf(entry)[0])) ? "" : "Some of these edits show only in mudg view.";
+    $("edit-notes").textContent = live || edits.every((entry) => [...SHOWN, "weather", "light"].includes(verbOf(entry)[0])) ? "" : "Some of these edits show only in mudg view.";
     if (!live) return;
     this.timer = setTimeout(async () => {
       try {
@@ -159,17 +180,31 @@ export class Editor {
         this.set([...(last ? edits.slice(0, -1) : edits), { move: settings }]);
       };
     }
+    const by = $("edit-by");
+    by.append(...[...this.own].map((name) => new Option(name, name)));
+    $("edit-replace").onclick = () => this.replace(id(), by.value);
+    $("edit-insert").onclick = () => this.insert(id());
+    $("fog").max = String(VISIBILITIES_M.length - 1);
+    $("fog").oninput = ({ target }) => { $("fog-text").textContent = visibility(VISIBILITIES_M[target.value]); };
+    $("fog").onchange = ({ target }) => this.conditions({ visibility_m: VISIBILITIES_M[target.value] });
+    $("light").append(...Object.entries(LIGHTS).map(([value, [name]]) => new Option(name, value)));
+    $("light").onchange = ({ target }) => this.conditions({ time: target.value });
     app.listeners.add(() => this.fields());
   }
 
   /** Fields of the selected object. */
   fields() {
+    const { visibility_m: seen, time } = conditionsOf(this.app.state.edits);
+    $("fog").value = String(VISIBILITIES_M.findLastIndex((one) => !seen ? one === 0 : one === 0 || one >= seen));
+    $("fog-text").textContent = visibility(seen);
+    $("light").value = time;
     const { selected } = this.app.state, shown = selected !== null && this.can(selected);
     $("edit-object").hidden = !shown;
     $("edit-hint").hidden = shown;
     $("edit-hint").textContent = selected !== null && !shown ? "This object is part of the background of the fit: mudg edit can move it." : "Select an object, in the picture or in the list.";
     if (!shown) return;
     $("edit-name").textContent = selected;
+    $("edit-others").hidden = !this.app.facts.live?.run || !this.own.has(selected);
     const last = this.lastMove(selected);
     for (const [field, name] of Object.entries(FIELDS)) if (document.activeElement !== $(field)) $(field).value = String(last?.[name] ?? 0);
   }
@@ -189,6 +224,8 @@ export class Editor {
     }));
   }
 }
+
+const visibility = (metres) => (metres ? `visibility ${metres} m` : "none");
 
 /** A path as the server says it. */
 function told({ rows, source }, recorded) {

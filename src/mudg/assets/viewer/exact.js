@@ -1,6 +1,7 @@
 // Behind `mudg view` stands a server that draws with the program's own rasterizer. When the camera rests, its frame replaces the page's.
 
 import { scriptText } from "mudg/edits";
+import { changes } from "mudg/weather";
 
 /** Asks for exact frames whenever the camera rests. */
 export function exactFrames(app) {
@@ -9,7 +10,7 @@ export function exactFrames(app) {
   let current = null, answered = null; // what is asked for; for which change of the view
   app.onRest = async () => {
     const s = app.state;
-    if (!live.layers.includes(s.layer) || app.editor.wrong || answered === app.changed) return;
+    if (!live.layers.includes(s.layer) || app.editor.wrong || changes(app.renderer.conditions) || answered === app.changed) return;
     current?.abort();
     answered = app.changed;
     current = new AbortController();

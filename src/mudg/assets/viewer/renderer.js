@@ -4,6 +4,7 @@
 import { TEXTURE_WIDTH } from "mudg/data";
 import * as shaders from "mudg/shaders";
 import { Sorter } from "mudg/sorter";
+import { preview } from "mudg/weather";
 
 /** Camera z below which nothing is drawn, metres; as everywhere in the program. */
 export const NEAR_M = 0.2;
@@ -44,6 +45,7 @@ export class Renderer {
     this.grids = gl.createTexture();
     this.empty = gl.createVertexArray();
     this.photo = { key: null, texture: null };
+    this.conditions = { visibility_m: 0, time: "as_recorded" };
   }
 
   // ---- resources ----
@@ -148,10 +150,14 @@ export class Renderer {
 
   // ---- order ----
 
+  /** What the sorter needs to know of a moment. */
+  request(loaded, view, t, hidden) {
+    return { poses: loaded.scene.placed(t, hidden).rows, eye: view.eye, ahead: view.axes[2], near: NEAR_M };
+  }
+
   /** Asks the scene's sorter for the order of a moment; `done` is called when it is there. A late one is better than none. */
   sort(loaded, view, t, hidden, done) {
-    const request = { poses: loaded.scene.placed(t, hidden).rows, eye: view.eye, ahead: view.axes[2], near: NEAR_M };
-    loaded.sorter.ask(request, (order) => {
+    loaded.sorter.ask(this.request(loaded, view, t, hidden), (order) => {
       if (order) this.use(loaded, order);
       done(order !== null);
     });
@@ -201,6 +207,7 @@ export class Renderer {
     gl.uniform2f(places.colorRange, loaded.scene.facts.color_low, loaded.scene.facts.color_high);
     gl.uniform1f(places.harmonicStep, loaded.scene.facts.harmonic_step ?? 0);
     gl.uniform1i(places.turning, loaded.scene.facts.harmonics_in_world ? 0 : 1); // colours turn with their object
+    gl.uniform4fv(places.fog, preview(this.conditions, loaded.scene.sky).fog);
     gl.uniform1f(places.nearest, NEAR_M);
     gl.uniform1i(places.layer, layer);
     gl.uniform1i(places.antialias, loaded.scene.facts.antialias ? 1 : 0);
@@ -246,6 +253,9 @@ export class Renderer {
       gl.uniform2f(places.depthRange, ...this.facts.depth_range_m);
       gl.uniform3fv(places.gain, view.gain);
       gl.uniform3fv(places.offset, view.offset);
+      const { fog, light } = preview(this.conditions, loaded.scene.sky);
+      gl.uniform4fv(places.fog, fog);
+      gl.uniform4fv(places.light, light);
     });
     return picture;
   }

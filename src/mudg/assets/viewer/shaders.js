@@ -14,7 +14,7 @@ precision highp float; precision highp int; precision highp usampler2DArray; pre
 export const splatVertex = (degree, texels, width, rows) => HEAD + `
 uniform usampler2DArray data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
-uniform vec2 colorRange; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
+uniform vec2 colorRange; uniform vec4 fog; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -107,7 +107,7 @@ void main() {
     uvec3 levels = uvec3(second.w, second.w >> 8, second.w >> 16) & 255u;
     payload.rgb = mix(vec3(colorRange.x), vec3(colorRange.y), vec3(levels) / 255.0);
     ${degree ? "payload.rgb += harmonics(normalize(turning ? fromEye * worldFromNode : fromEye));" : ""}
-    payload.rgb = max(payload.rgb, 0.0);
+    payload.rgb = mix(fog.rgb, max(payload.rgb, 0.0), exp(-fog.a * length(fromEye))); // a preview
   } else if (layer == 1) payload.rgb = vec3(c.z);
   else if (layer == 3) payload.rgb = tint(node);
   else if (layer == 4) { // the shortest axis, towards the camera
@@ -141,7 +141,7 @@ void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2
 /** Sums of one layer to a picture: sky behind colours, depth and confidence through their colour scales. */
 export const resolveFragment = HEAD + `
 uniform sampler2D sums, sky, scales; uniform int layer; uniform bool hasSky;
-uniform mat3 worldFromCamera; uniform vec4 intrinsics; uniform vec2 size, depthRange; uniform vec3 gain, offset;
+uniform mat3 worldFromCamera; uniform vec4 intrinsics; uniform vec2 size, depthRange; uniform vec3 gain, offset; uniform vec4 fog, light;
 out vec4 color;
 void main() {
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
@@ -151,9 +151,12 @@ void main() {
       vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
       vec3 ray = worldFromCamera * vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0);
       vec2 at = vec2(atan(ray.y, ray.x) / 6.2831853 + 0.5, 0.5 - atan(ray.z, length(ray.xy)) / 3.14159265);
-      rgb += (1.0 - sum.a) * texture(sky, at).rgb;
+      vec3 behind = texture(sky, at).rgb;
+      if (fog.a > 0.0) behind = mix(fog.rgb, behind, exp(-fog.a * 300.0 / max(ray.z / length(ray), 0.01))); // fog is 300 m high
+      rgb += (1.0 - sum.a) * behind;
     }
     rgb = gain * rgb + offset;
+    rgb = light.rgb * mix(vec3(dot(rgb, vec3(0.2126, 0.7152, 0.0722))), rgb, light.a);
   } else if (layer == 1) {
     float t = clamp(log(sum.r / max(sum.a, 1e-6) / depthRange.x) / log(depthRange.y / depthRange.x), 0.0, 1.0);
     rgb = sum.a < 0.5 ? vec3(0.0) : texture(scales, vec2((t * 255.0 + 0.5) / 256.0, 0.5)).rgb;

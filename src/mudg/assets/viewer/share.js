@@ -3,8 +3,10 @@
 import { scaled } from "mudg/app";
 import { scriptText } from "mudg/edits";
 import { toHash } from "mudg/state";
+import { zipOf } from "mudg/zip";
 
 const MOST_SIDE = 8192;
+const FRAMES_PER_S = 10;
 
 function save(blob, name) {
   const link = document.createElement("a");
@@ -16,27 +18,56 @@ function save(blob, name) {
 
 const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
 
-/** Saves what is shown as PNG, `times` as large; boxes and points are drawn on it as on the page. */
-export function savePicture(app, times) {
+/** What is shown, `times` as large, on a canvas of its own; boxes and points are drawn on it as on the page. */
+function sheetOf(app, times) {
   const { canvas, overlay, renderer, state } = app, whole = app.last.view, factor = Math.min(times, MOST_SIDE / Math.max(whole.width, whole.height));
   const before = [canvas.width, canvas.height], view = scaled(whole, factor), { left, right, mode } = app.used();
   Object.assign(canvas, { width: view.width, height: view.height });
-  const area = [0, 0, view.width, view.height];
   renderer.present(app.pictureOf("left", left, view) ?? app.pictureOf("left", left, view, "color"),
-    right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null, area, mode, state.divider);
+    right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null, [0, 0, view.width, view.height], mode, state.divider);
   const sheet = Object.assign(document.createElement("canvas"), { width: view.width, height: view.height }), c = sheet.getContext("2d");
   c.drawImage(canvas, 0, 0);
-  c.drawImage(overlay, ...app.last.area, 0, 0, view.width, view.height);
+  if (overlay.style.visibility !== "hidden") c.drawImage(overlay, ...app.last.area, 0, 0, view.width, view.height);
   Object.assign(canvas, { width: before[0], height: before[1] });
-  app.change();
-  return new Promise((resolve) => sheet.toBlob((blob) => { save(blob, nameOf(app, "png")); resolve(blob.size); }, "image/png"));
+  return sheet;
 }
 
-/** Plays the drive once and records the picture; the browser encodes it. */
+const pngOf = (sheet) => new Promise((resolve) => sheet.toBlob(resolve, "image/png"));
+
+/** Saves what is shown as PNG, `times` as large. */
+export async function savePicture(app, times) {
+  const blob = await pngOf(sheetOf(app, times));
+  app.change();
+  save(blob, nameOf(app, "png"));
+  return blob.size;
+}
+
+/** Saves the whole drive as pictures in an archive: each is drawn in full, however long that takes. Asked for once more, it ends early. */
+export async function saveFrames(app, say) {
+  if (app.saving) { app.saving = false; return; }
+  app.saving = true;
+  const { t, playing } = app.state, count = Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1, files = [];
+  try {
+    for (let k = 0; k < count && app.saving; k++) {
+      say(`Frame ${k + 1} of ${count}. Frames ends it.`);
+      await app.settled({ t: k / FRAMES_PER_S, playing: false });
+      files.push({ name: `${String(k).padStart(5, "0")}.png`, blob: await pngOf(sheetOf(app, 1)) });
+    }
+    const archive = await zipOf(files);
+    save(archive, nameOf(app, "zip"));
+    say(`Saved ${files.length} frames. For a video: ffmpeg -framerate ${FRAMES_PER_S} -i %05d.png drive.mp4`);
+    return archive;
+  } finally {
+    app.saving = false;
+    app.change({ t, playing });
+  }
+}
+
+/** Plays the drive once and records the picture; the browser encodes it. One that cannot saves frames. */
 export function recordVideo(app, say) {
-  if (!("MediaRecorder" in window) || !app.canvas.captureStream) return say("This browser cannot record videos.");
+  if (!("MediaRecorder" in window) || !app.canvas.captureStream) return saveFrames(app, say);
   const kind = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"].find((one) => MediaRecorder.isTypeSupported(one));
-  if (!kind) return say("This browser has no video encoder.");
+  if (!kind) return saveFrames(app, say);
   const recorder = new MediaRecorder(app.canvas.captureStream(30), { mimeType: kind, videoBitsPerSecond: 8e6 }), parts = [];
   const { loop } = app.state;
   recorder.ondataavailable = ({ data }) => parts.push(data);

@@ -4,7 +4,7 @@ import { MODES } from "mudg/cameras";
 import { LAYERS } from "mudg/shaders";
 import { clamp, project } from "mudg/math";
 import { trackColor } from "mudg/overlay";
-import { recordVideo, saveEdits, saveLink, savePicture } from "mudg/share";
+import { recordVideo, saveEdits, saveFrames, saveLink, savePicture } from "mudg/share";
 
 const LAYER_NAMES = { color: "Color", depth: "Depth", class: "Classes", instance: "Objects", normal: "Normals", confidence: "Confidence", recorded: "Recorded" };
 const OVERLAYS = { boxes: "Boxes", paths: "Trajectories", lidar: "LiDAR", cameras: "Recorded cameras" };
@@ -193,6 +193,7 @@ export class Controls {
     const { app } = this;
     $("picture").onclick = () => savePicture(app, Number($("times").value));
     $("video").onclick = () => recordVideo(app, (text) => this.say(text));
+    $("frames").onclick = () => saveFrames(app, (text) => this.say(text));
     $("link").onclick = async () => this.say(await saveLink(app));
     $("help").onclick = () => $("keys").showModal();
     $("open").onclick = () => { const shown = document.body.classList.toggle("with-panel"); $("open").setAttribute("aria-expanded", String(shown)); app.change(); };

@@ -24,8 +24,8 @@ TEXELS: Final = (2, 3, 4, 5)
 SORT_BYTES: Final = 38
 """Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 MODULES: Final = (
-    "math", "data", "sorter", "shaders", "renderer", "cameras", "state", "overlay", "edits", "arrival", "app", "share", "gizmo", "editor",
-    "ui", "input", "exact", "main",
+    "math", "data", "sorter", "shaders", "edits", "weather", "renderer", "cameras", "state", "overlay", "arrival", "app", "zip", "share",
+    "gizmo", "editor", "ui", "input", "exact", "main",
 )  # fmt: skip
 
 

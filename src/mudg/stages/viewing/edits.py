@@ -22,6 +22,7 @@ from mudg.models.scene.nodes import RigidNode
 from mudg.report.viewer.facts import begin_of
 from mudg.report.viewer.packed import key_rows
 from mudg.stages.editing.carried import EditedDrive, carry_out
+from mudg.stages.editing.runs import find_run
 
 MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
 """First line of a saved script; a file without it belongs to somebody else."""
@@ -56,6 +57,7 @@ class EditDesk:
     Args:
         models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page begins with.
         place: file to save to. overwrite: even if it is not one of ours.
+        run: the finished run that is shown, whose objects a page may insert; empty where it is a fit alone.
     """
 
     models: Sequence[SceneModel]
@@ -64,6 +66,7 @@ class EditDesk:
     place: Path
     begin: EditScript | None = None
     overwrite: bool = False
+    run: str = ""
     _made: dict[str, tuple[EditedDrive, list[SceneModel]]] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -95,7 +98,7 @@ class EditDesk:
                 known = (
                     {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
                 )
-                foreign = sorted(set(script.files()) - known)
+                foreign = sorted(set(script.files()) - known - {self.run})
                 if foreign:
                     raise InputError("a page may name no files but those of --edits", where=NAME, got=foreign[0],
                         remedy="write them into the script by hand")  # fmt: skip
@@ -153,7 +156,7 @@ def _unseen(drive: EditedDrive) -> list[str]:
     """What exact frames do not show of a script."""
     said = []
     if drive.plan.conditions:
-        said.append(f"{', '.join(drive.plan.conditions)}: mudg render shows it, this page does not")
+        said.append(f"{', '.join(drive.plan.conditions)}: mudg render shows it, this page at most a preview of fog and light")
     if drive.plan.moves_ego:
         said.append(
             "the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"
@@ -170,7 +173,8 @@ def desk_for(
         InputError: the script cannot be carried out. UsageError: edits would be saved into a finished result.
     """
     begin = None if files.script is None else read_edits(files.script)
-    desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite)
+    own = str(Path(run).resolve()) if find_run(run).whole else ""
+    desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite, own)
     if begin is not None:
         carry_out(begin, models[0], scene, cloud)
     return desk

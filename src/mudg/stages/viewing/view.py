@@ -260,7 +260,7 @@ def server_of(
     shown = find_shown(config, run, scene, compare)
     layers = list(LAYERS) if config.exact else []
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
-    live = {"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name}
+    live = {"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
     page, facts = replace(page_of(config, shown, live=live), effort=1), dict[str, Any]()  # nothing leaves this machine
     served = {file.url: file.content for file in page.files(facts)}
     size = sum(map(len, served.values()))
