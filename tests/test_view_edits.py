@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import shutil
+import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, NO_BROWSER, Browser
+from PIL import Image
 from toy_fitted import STREET, write_toy_run
 
 from mudg.base.errors import InputError, UsageError
@@ -102,6 +107,24 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
     plain = render_view(model, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
     assert np.abs(seen - true).max() < 0.003
     assert np.abs(seen - plain).max() > 0.1
+
+
+def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(toy[0] / "scene", run / "scene")
+    shutil.copytree(toy[1], run / "fit" / "street_gaussians")
+    (run / "fuse").mkdir()
+    (run / "fuse" / "fuse.json").write_text("{}")
+    desk = desk_for([toy[2]], read_scene(run / "scene"), None, run, EditFiles(out=tmp_path / "edits.yaml"))
+    script = f'- insert: {{asset: {{run: "{desk.run}", id: car-1}}, near: {{id: ego, at_s: 0.2, ahead_m: 12}}, ground: false}}\n'
+    told = said(desk, script)
+    (edited,) = desk.edited(script)
+    (name,) = told["inserted"]
+    assert name in edited.node_names() and name not in toy[2].node_names()
+    with pytest.raises(InputError, match="no files"):
+        said(desk, script.replace(desk.run, str(tmp_path / "another")))
+    with pytest.raises(InputError, match="no files"):  # a fit alone is no run
+        said(desk_of(toy, tmp_path / "edits.yaml"), script)
 
 
 def test_edits_are_saved_as_a_script_and_replace_only_their_own_file(toy: Toy, tmp_path: Path) -> None:
@@ -325,3 +348,46 @@ def test_a_page_with_a_server_checks_and_saves(toy: Toy, tmp_path: Path) -> None
         one.close()
         server.shutdown()
         server.server_close()
+
+
+@pytest.mark.slow
+def test_fog_and_light_are_previewed_and_saved(opened: Browser, toy: Toy, tmp_path: Path) -> None:
+    picture = (
+        "(async () => { await mudg.settled({});"
+        " const p = mudg.renderer.bytes(mudg.pictureOf('measured', mudg.loaded[0], mudg.last.view, 'color'));"
+        " return p.reduce((sum, v, i) => sum + (i % 4 < 3 ? v : 0), 0) / p.length / 0.75; })()"
+    )
+    opened.run("mudg.editor.set([]); 1")
+    plain = opened.run(picture)
+    set_to = "(() => {{ const e = document.getElementById('{0}'); e.value = '{1}'; e.dispatchEvent(new Event('change')); }})()"
+    opened.run(set_to.format("fog", 7))
+    foggy = opened.run(picture)
+    opened.run(set_to.format("light", "night"))
+    night = opened.run(picture)
+    assert abs(foggy - plain) > 3
+    assert night < 0.5 * foggy
+    script = opened.run("import('mudg/edits').then((edits) => edits.scriptText(mudg.state.edits))")
+    (tmp_path / "edits.yaml").write_text(script, encoding="utf-8")
+    weather, light = read_edits(tmp_path / "edits.yaml").edits
+    assert (weather.settings.fog.visibility_m, light.settings.time) == (30, "night")
+    opened.run(set_to.format("light", "as_recorded"))
+    opened.run(set_to.format("fog", 0))
+    assert opened.run("mudg.state.edits.length") == 0
+    assert opened.run(picture) == pytest.approx(plain, abs=0.01)
+
+
+@pytest.mark.slow
+def test_a_drive_is_saved_as_frames(opened: Browser, tmp_path: Path) -> None:
+    opened.run("mudg.editor.set([]); URL.createObjectURL = () => 'data:,'; 1")
+    text = opened.run(
+        "(async () => { const { saveFrames } = await import('mudg/share'); const zip = await saveFrames(mudg, () => {});"
+        "const bytes = new Uint8Array(await zip.arrayBuffer()); let text = '';"
+        "for (const b of bytes) text += String.fromCharCode(b); return btoa(text); })()"
+    )
+    with zipfile.ZipFile(io.BytesIO(base64.b64decode(text))) as archive:
+        assert archive.testzip() is None
+        names = archive.namelist()
+        pictures = [np.asarray(Image.open(io.BytesIO(archive.read(name))).convert("RGB")) for name in names]
+    assert names == [f"{k:05d}.png" for k in range(9)]  # 0.8 s
+    moved = [np.abs(a.astype(int) - b).max() for a, b in zip(pictures, pictures[1:])]
+    assert min(moved) > 10  # the car drives in all of them

@@ -11,7 +11,7 @@ import { fromHash, initialState, toHash } from "mudg/state";
 const REST_MS = 180; // without a change: draw at full size
 const SLOW_MS = 45, QUICK_MS = 18; // of a frame while moving: draw smaller, or larger again
 const SMALLEST = 0.22;
-const FRESH_MS = 250; // at least, between pictures with more and more of a scene
+const FRESH_MS = 250, FRESH_TIMES = 10; // at least, between pictures with more and more of a scene; and in times of the last one
 const CERTAIN = 0.2; // certainty from which on a surface is called determined by the recording
 const LONGEST_MS = 2500, LOADING_MS = 300; // of a picture at rest, and while chunks arrive: what would take longer is drawn smaller
 const PROBES = [SMALLEST, 0.4]; // sizes of the first pictures, which tell how long larger ones take
@@ -122,7 +122,7 @@ export class App {
     }
     this.move?.(Math.min(0.1, (now - (this.before ?? now)) / 1000));
     this.before = now;
-    if (this.fresh && now - this.drawnAt > Math.max(FRESH_MS, 2 * this.drawMs)) { // more Gaussians, but not at the cost of the controls
+    if (this.fresh && now - this.drawnAt > Math.max(FRESH_MS, FRESH_TIMES * this.drawMs)) { // more Gaussians, but not at the cost of the controls
       this.fresh = false;
       this.again();
     }

@@ -202,6 +202,7 @@ const flow = (value) => Array.isArray(value) ? `[${value.map(flow).join(", ")}]`
 /** One line about an edit. */
 export function summary(entry) {
   const [verb, given] = verbOf(entry), who = given?.ids?.join(", ") ?? given?.id ?? "";
-  const rest = Object.entries(given ?? {}).filter(([name]) => name !== "id" && name !== "ids").map(([name, value]) => `${name} ${typeof value === "object" ? "..." : value}`);
-  return `${verb} ${who}${rest.length ? `: ${rest.join(", ")}` : ""}`;
+  const short = (value) => { const text = typeof value === "object" ? flow(value) : String(value); return text.length > 60 ? "..." : text; };
+  const rest = Object.entries(given ?? {}).filter(([name]) => name !== "id" && name !== "ids").map(([name, value]) => `${name} ${short(value)}`);
+  return `${[verb, who].filter(Boolean).join(" ")}${rest.length ? `: ${rest.join(", ")}` : ""}`;
 }

@@ -9,6 +9,7 @@ import { recordVideo, saveEdits, saveFrames, saveLink, savePicture } from "mudg/
 const LAYER_NAMES = { color: "Color", depth: "Depth", class: "Classes", instance: "Objects", normal: "Normals", confidence: "Confidence", recorded: "Recorded" };
 const OVERLAYS = { boxes: "Boxes", paths: "Trajectories", lidar: "LiDAR", cameras: "Recorded cameras" };
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
+const SEEN = 0.6, PARTLY = 0.35; // shares of a view that the recording determines
 const $ = (id) => document.getElementById(id);
 
 /** An element with attributes and children; text is always text. */
@@ -138,6 +139,9 @@ export class Controls {
     const where = state.mode === "recorded" && !state.shift && !state.up ? "Recorded path." : `${away.toFixed(1)} m from the nearest recorded camera.`;
     const held = state.mode === "recorded" && !state.shift && !state.up && app.drive.nearestFrame(state.camera, state.t);
     const split = held && Math.abs(held.t - state.t) < 1e-3 ? (held.split === "test" ? " This frame was held out of the fit." : " The fit learned from this frame.") : "";
+    const word = share === null ? "" : share >= SEEN ? "Seen by the recording" : share >= PARTLY ? "Partly seen by the recording" : "Mostly not seen by the recording";
+    $("seen-word").textContent = word;
+    $("seen-word").className = share >= SEEN ? "good" : share >= PARTLY ? "fair" : "poor";
     const known = share === null ? "" : ` The recording determines ${Math.round(100 * share)} % of what is drawn here.`;
     $("seen").textContent = where + split + known;
     $("seen").dataset.share = share === null ? "" : share.toFixed(4);

@@ -6,7 +6,7 @@ import { verbOf } from "mudg/edits";
 export const VISIBILITIES_M = [0, 1000, 500, 250, 150, 100, 60, 30];
 /** Light by its name in scripts: name for people, factor of red, green and blue, saturation. */
 export const LIGHTS = {
-  as_recorded: ["As recorded", [1, 1, 1], 1], overcast: ["Overcast", [0.92, 0.95, 1], 0.75], dusk: ["Dusk", [0.62, 0.5, 0.5], 0.85], night: ["Night", [0.13, 0.15, 0.22], 0.6],
+  as_recorded: ["As recorded", [1, 1, 1], 1], overcast: ["Overcast", [0.92, 0.95, 1], 0.75], dusk: ["Dusk", [0.62, 0.5, 0.5], 0.85], night: ["Night", [0.24, 0.27, 0.36], 0.6],
 };
 const EXTINCTION = 3; // Koschmieder: at the distance of the visibility 5 % are left
 const DAYLIGHT = [0.76, 0.79, 0.82]; // of fog where a scene has no sky
