@@ -204,6 +204,9 @@ export class Editor {
     $("edit-hint").textContent = selected !== null && !shown ? "This object is part of the background of the fit: mudg edit can move it." : "Select an object, in the picture or in the list.";
     if (!shown) return;
     $("edit-name").textContent = selected;
+    for (const one of $("edit-by").options) one.disabled = one.value === selected;
+    if ($("edit-by").selectedOptions[0]?.disabled) $("edit-by").selectedIndex = [...$("edit-by").options].findIndex((one) => !one.disabled);
+    $("edit-replace").disabled = this.own.size < 2;
     $("edit-others").hidden = !this.app.facts.live?.run || !this.own.has(selected);
     const last = this.lastMove(selected);
     for (const [field, name] of Object.entries(FIELDS)) if (document.activeElement !== $(field)) $(field).value = String(last?.[name] ?? 0);

@@ -202,7 +202,7 @@ const flow = (value) => Array.isArray(value) ? `[${value.map(flow).join(", ")}]`
 /** One line about an edit. */
 export function summary(entry) {
   const [verb, given] = verbOf(entry), who = given?.ids?.join(", ") ?? given?.id ?? "";
-  const short = (value) => { const text = typeof value === "object" ? flow(value) : String(value); return text.length > 60 ? "..." : text; };
+  const short = (value) => { const text = value?.run && value.id ? value.id : typeof value === "object" ? flow(value) : String(value); return text.length > 60 ? "..." : text; };
   const rest = Object.entries(given ?? {}).filter(([name]) => name !== "id" && name !== "ids").map(([name, value]) => `${name} ${short(value)}`);
   return `${[verb, who].filter(Boolean).join(" ")}${rest.length ? `: ${rest.join(", ")}` : ""}`;
 }
