@@ -2,7 +2,8 @@
 
 Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
 cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
-messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2)
+messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2),
+            OUT/NAME.ncore4.zarr.itar (NCore)
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from mudg.models.scene.model import SceneModel
 from mudg.stages.config import ExportConfig
 from mudg.stages.editing.carried import carry_out, read_and_digest
 from mudg.stages.editing.runs import RunParts, find_run
-from mudg.stages.exporting.messages import BAG, Told, records_of, refuse_missing, write_bag, write_file
+from mudg.stages.exporting.messages import FOLDERS, Told, records_of, refuse_missing, write_file, write_folder
 from mudg.stages.exporting.messages import SUFFIXES as MESSAGES
 from mudg.stages.exporting.scenes import splat_scene, with_sky_sphere
 from mudg.stages.fitting.storage import load_model, model_of_scene
@@ -85,10 +86,10 @@ def run(
     refuse_missing(name)
     given = _opened(source, scene, edits, name in FORMATS)
     refuse_overlap(out, {"scene": given.parts.scene, **given.named})
-    if cameras or name == "ros2":
+    if cameras or name in FOLDERS:
         recorded, settings = _known(given), {**result_settings(config), "format": name}
-        folder = RunDir.open(out, _FOLDER if cameras else BAG, settings, given.inputs, overwrite)
-        return _cameras(name, given, recorded, folder) if cameras else write_bag(records_of(recorded, _points(given)), folder)
+        folder = RunDir.open(out, _FOLDER if cameras else FOLDERS[name], settings, given.inputs, overwrite)
+        return _cameras(name, given, recorded, folder) if cameras else write_folder(name, records_of(recorded, _points(given)), folder)
     _refuse_name(out, name, overwrite)
     if name in MESSAGES:
         return _messages(config, name, given, Path(out))
