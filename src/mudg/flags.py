@@ -207,7 +207,7 @@ class ExportFlags(Common):
     """Flags of ``mudg export``."""
 
     format: Annotated[str, tyro.conf.Positional, arg(metavar="FORMAT")]
-    """Gaussians: ply, bundle, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras and images: nerfstudio, colmap, colmap-text.
+    """Gaussians: ply, bundle, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text.
     The log over time: mcap, ros2, rerun, ncore."""
     run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
     """Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory."""
