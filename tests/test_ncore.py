@@ -503,7 +503,7 @@ def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Pat
         flipped = bytearray(content)
         flipped[at] ^= 1 << int(rng.integers(8))
         target.write_bytes(bytes(flipped))
-        with contextlib.suppress(InputError):
+        with contextlib.suppress(InputError), at_most(600):
             ingest(target.parent, tmp_path / f"flipped{number}")
             continue
         assert not (tmp_path / f"flipped{number}").exists()

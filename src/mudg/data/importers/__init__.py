@@ -78,7 +78,10 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 
 
 def _import(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
-    return _functions(name)[1](source, out, options)
+    from mudg.data.importers.common import foreign_numbers
+
+    with foreign_numbers():
+        return _functions(name)[1](source, out, options)
 
 
 def _looks_like(name: str, source: Path) -> bool:

@@ -142,7 +142,9 @@ def read_cloud(content: bytes, name: str, axes: Axes = "viewer") -> tuple[SplatC
     read = FORMATS[found].read
     if read is None:  # no mark leads here
         raise InputError("files of this format are not read", where=name, got=found)
-    return read(content, name).moved(geometry.invert(file_from_world(found, axes))), found
+    with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
+        cloud = read(content, name)
+    return cloud.moved(geometry.invert(file_from_world(found, axes))), found
 
 
 def losses(name: str, request: WriteRequest) -> list[str]:
