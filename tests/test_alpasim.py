@@ -194,6 +194,9 @@ def test_the_command_needs_a_drive(tmp_path: Path) -> None:
     scene = SplatScene("toy", toy_splats.scene().nodes)
     with pytest.raises(InputError, match="none is known"):
         alpasim.to_package(scene, None, ground())
+    parked = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
+    with pytest.raises(InputError, match="none is known"):
+        alpasim.to_package(scene, replace(drive(), ego=parked), ground())
     with pytest.raises(InputError, match="ground"):
         alpasim.to_package(scene, drive(), None)
     save_model(toy_fitted(0), tmp_path / "fit")

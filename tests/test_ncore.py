@@ -22,7 +22,7 @@ from roundtrip import needs_native
 from mudg import cli
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.types import Camera, Frame, Scene, SweepPoints
+from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
 from mudg.data.exporters.log_records import LogRecords
 from mudg.data.exporters.ncore import sensor_ids, write_ncore
 from mudg.data.importers import IMPORTERS, RECOGNISERS
@@ -302,6 +302,34 @@ def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.M
         ingest(tmp_path, tmp_path / "out")
     assert cli.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0
     assert not (tmp_path / "out").exists()
+
+
+@needs_package
+def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None:
+    nowhere = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
+    with pytest.raises(InputError, match="vehicle's path"):
+        write_ncore(tmp_path, records(truth, ego=nowhere))
+    twice = replace(truth.frames[0], id="front/000099")
+    with pytest.raises(InputError, match="front/000099"):
+        write_ncore(tmp_path, records(truth, frames=(*truth.frames, twice)))
+    early = replace(truth, sweeps=truth.sweeps[:1])
+    reads = records(early)
+    late = LogRecords(
+        early, reads.picture, lambda sweep: replace(reads.points(sweep), dt_s=reads.points(sweep).dt_s - 3)
+    )
+    with pytest.raises(InputError, match="more than a second"):
+        write_ncore(tmp_path, late)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_package
+def test_one_vehicle_pose_and_no_sweep_are_enough(truth: Scene, tmp_path: Path) -> None:
+    still = EgoPath(truth.ego.times_s[:1], truth.ego.world_from_ego[:1])
+    alone = replace(truth, ego=still, sweeps=(), tracks=())
+    write_ncore(tmp_path, records(alone))
+    scene = ingest(tmp_path, tmp_path / "back")
+    roundtrip.assert_same_log(scene, alone, time_s=1e-9, intrinsics_px=1e-5)
+    assert "no LiDAR sweeps in the recording" in scene.source.notes
 
 
 @needs_package

@@ -73,6 +73,8 @@ class _WrittenLog:
     def __init__(self, records: LogRecords) -> None:
         self._package = package()
         self._log, self._scene = records, records.scene
+        if not len(self._scene.ego.times_s):
+            raise InputError("a recording needs the vehicle's path, and the scene has none", where=self._scene.id)
         self._zero_us = START_US - round(records.start_s * MICRO)
         self._frames = {name: list(self._scene.frames_of(name)) for name in self._scene.cameras}
         self._sweeps: dict[str, list[Sweep]] = {}

@@ -52,7 +52,7 @@ def to_package(scene: SplatScene, log: Scene | None, ground: HeightMap | None) -
     Raises:
         InputError: no drive or no ground is known, or a camera has no place on the vehicle.
     """
-    if log is None:
+    if log is None or not len(log.ego.times_s):
         raise InputError("AlpaSim replays a drive, and none is known here", where=scene.name,
             remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
     if ground is None:
