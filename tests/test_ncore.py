@@ -26,7 +26,8 @@ from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
 from mudg.data.exporters.log_records import LogRecords
 from mudg.data.exporters.ncore import sensor_ids, write_ncore
 from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.ncore import container
+from mudg.data.importers.images import brown_conrady, equidistant, fit_images
+from mudg.data.importers.ncore import container, importer
 from mudg.data.importers.options import ImportOptions
 from mudg.data.ncore import PoseKeys, euler_of, package, rotation_of
 from mudg.data.scene import read_label, read_points
@@ -267,6 +268,49 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
         stands = track.pose_at((at - 1_090_000) / 1e6)  # the first image is taken at 1.09 s
         placed = world @ pose @ geometry.yaw_matrix(0.3, (8.0, 1.0, -1.0))
         assert stands is not None and np.abs(stands - placed).max() < 1e-5
+
+
+@needs_package
+@pytest.mark.parametrize("kind", ["opencv-pinhole", "opencv-fisheye", "ftheta"])
+def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None:
+    """Projections against this program's own formulas; a lens of 120 degrees loses its rim, not its scale."""
+    data = package().data
+    size, point, focal = (
+        np.array([960, 604], np.uint64),
+        np.array([470, 310], np.float32),
+        np.array([440, 442], np.float32),
+    )
+    common = {
+        "resolution": size,
+        "shutter_type": data.ShutterType.GLOBAL,
+        "external_distortion_parameters": None,
+        "principal_point": point,
+    }
+    if kind == "opencv-pinhole":
+        radial, tangential = np.array([-0.1, 0.01, 0, 0, 0, 0], np.float32), np.array([1e-3, -2e-3], np.float32)
+        model = data.OpenCVPinholeCameraModelParameters(**common, focal_length=focal, radial_coeffs=radial, tangential_coeffs=tangential,
+                                                        thin_prism_coeffs=np.zeros(4, np.float32))  # fmt: skip
+        wanted = brown_conrady(*map(float, radial[:2]), *map(float, tangential))
+    elif kind == "opencv-fisheye":
+        bend = np.array([0.02, -0.003, 0, 0], np.float32)
+        model = data.OpenCVFisheyeCameraModelParameters(**common, focal_length=focal, radial_coeffs=bend, max_angle=1.3)
+        wanted = equidistant(*map(float, bend))
+    else:
+        model = data.FThetaCameraModelParameters(
+            **common, reference_poly=data.FThetaCameraModelParameters.PolynomialType.ANGLE_TO_PIXELDIST, max_angle=1.2,
+            pixeldist_to_angle_poly=np.array([0, 1 / 442, 0, 0, 0, 0], np.float32),
+            angle_to_pixeldist_poly=np.array([0, 442, 0, 0, 0, 0], np.float32),
+        )  # fmt: skip
+        wanted = equidistant()
+    like = model.paraxial_pinhole_geometry()
+    camera = Camera("front", 960, 604, *map(float, like.focal_length), *map(float, like.principal_point))
+    lens = importer._lens(model, camera)
+    xy = np.random.default_rng(5).uniform(-0.8, 0.8, (100, 2))
+    assert np.abs(lens(xy) - wanted(xy)).max() < 1e-5
+    fit = fit_images(camera, ImportOptions(), lens)
+    assert 1.0 <= fit.camera.fx / camera.fx < 1.2 and (fit.camera.cx, fit.camera.cy) == (camera.cx, camera.cy)
+    if kind == "ftheta":  # centres of pixels count from 0 there
+        assert (camera.cx, camera.cy) == (470.5, 310.5)
 
 
 def _origin(scene: Scene, path: np.ndarray, keys: np.ndarray) -> np.ndarray:
