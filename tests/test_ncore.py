@@ -472,6 +472,8 @@ def _hostile(kind: str) -> bytes:
         return _itar(members, metadata, {"items": ["a"], "offset_datas": [1 << 50], "sizes": [10]})
     elif kind == "index of another kind":
         return _itar(members, metadata, {"items": 7, "offset_datas": [1], "sizes": []})
+    elif kind == "a million lists":
+        metadata["x/.zattrs"] = [[] for _ in range(900_000)]
     elif kind == "deep metadata":
         deep: Any = 0
         for _ in range(400):
@@ -486,6 +488,7 @@ SAID = {
     "array without chunks": "larger than its file", "pickled array": "packed in a way", "another codec": "packed in a way",
     "chunk that says it is larger": "larger than its file|another size|damaged", "member outside": "outside of the file",
     "index of another kind": "index", "deep metadata": "are damaged", "nothing in it": "cannot be read|no poses",
+    "a million lists": "cannot be read|no poses",
 }  # fmt: skip
 
 
@@ -495,7 +498,16 @@ def test_hostile_stores_are_refused_before_they_cost_memory(kind: str, tmp_path:
     (tmp_path / "a.ncore4.zarr.itar").write_bytes(_hostile(kind))
     with at_most(150):
         error = roundtrip.assert_refused(ingest, tmp_path, tmp_path / "out", SAID[kind])
-    assert "a.ncore4" in error.where or kind == "nothing in it"
+    assert "a.ncore4" in error.where or kind in ("nothing in it", "a million lists")
+
+
+@needs_package
+def test_metadata_that_would_fill_the_memory_are_refused_before_they_are_taken_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mudg.base.memory.free_bytes", lambda: 50 << 20)
+    with pytest.raises(ResourceError, match=r"needs more memory(?s:.*)68.7 MiB"):
+        container._cbor(b"\x9a\x00\x0d\xbb\xa0" + b"\x80" * 900_000, "a store")
 
 
 def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mudg.base import store
+from mudg.base import memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.data.importers.columns import record_fields
 
@@ -27,9 +27,12 @@ METADATA: Final = ".zmetadata.cbor.xz"
 _BLOCK: Final = 512
 _HEADER: Final = struct.Struct("<4sIQI")
 _XZ_MEMORY: Final = 256 << 20
-_LEAST_UNPACKED: Final = 16 << 20
-_MOST_GROWTH: Final = 60
+_LEAST_UNPACKED: Final = 1 << 20
+_MOST_GROWTH: Final = 40
 """Metadata unpack to no more than this times their compressed size (poses and boxes: some 5 to 20)."""
+_CONTAINERS: Final = bytes(range(0x80, 0xC0))
+"""Bytes that begin a list or a map in CBOR."""
+_CONTAINER_BYTES: Final = 72
 _MOST_LZ4: Final = 256
 _BLOSC_HEADER: Final = struct.Struct("<4B3I")
 _KINDS: Final = "biufS"
@@ -144,6 +147,10 @@ def _unpacked(packed: bytes, where: str) -> bytes:
 def _cbor(content: bytes, where: str) -> Any:
     import cbor2  # type: ignore[import-not-found]
 
+    heads = len(content) - len(
+        content.translate(None, _CONTAINERS)
+    )  # as many lists and maps at most: a byte makes an object
+    memory.require(_CONTAINER_BYTES * heads + 8 * len(content), f"reading {where}", "a machine with more memory")
     try:
         found = cbor2.loads(content)
     except (
