@@ -303,7 +303,8 @@ def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None
         )  # fmt: skip
         wanted = equidistant()
     like = model.paraxial_pinhole_geometry()
-    camera = Camera("front", 960, 604, *map(float, like.focal_length), *map(float, like.principal_point))
+    (fx, fy), (cx, cy) = like.focal_length.tolist(), like.principal_point.tolist()
+    camera = Camera("front", 960, 604, fx, fy, cx, cy)
     lens = importer._lens(model, camera)
     xy = np.random.default_rng(5).uniform(-0.8, 0.8, (100, 2))
     assert np.abs(lens(xy) - wanted(xy)).max() < 1e-5
