@@ -203,7 +203,7 @@ def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "name", "out", "said"),
     [
-        ({}, "ncore", "a.ply", "no export format 'ncore'"),
+        ({}, "obj", "a.obj", "no export format 'obj'"),
         ({}, "ply", "a.spz", "does not fit its format"),
         ({"animated": True}, "ply", "a.ply", "cannot hold motion"),
         ({"animated": True, "time_s": 1.0}, "glb", "a.glb", "one moment or the motion"),

@@ -339,7 +339,8 @@ VERBS: dict[str, Verb] = {
         "Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.",
         ("mudg export ply runs/kitti --out kitti.ply --time-s 1.5", "mudg export usdz runs/kitti --out kitti.usdz",
          "mudg export glb runs/mudg_s --scene scenes/city --edits edits.yaml --out city.glb",
-         "mudg export colmap scenes/city --out city_colmap", "mudg export ros2 scenes/city --out city_bag"),
+         "mudg export alpasim runs/kitti --out kitti_sim.usdz", "mudg export colmap scenes/city --out city_colmap",
+         "mudg export ros2 scenes/city --out city_bag", "mudg export ncore scenes/city --out city_ncore"),
         _export,
     ),
     "page": Verb(

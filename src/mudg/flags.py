@@ -207,12 +207,12 @@ class ExportFlags(Common):
     """Flags of ``mudg export``."""
 
     format: Annotated[str, tyro.conf.Positional, arg(metavar="FORMAT")]
-    """Gaussians: ply, bundle, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras and images: nerfstudio, colmap, colmap-text.
-    The log over time: mcap, ros2, rerun."""
+    """Gaussians: ply, bundle, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text.
+    The log over time: mcap, ros2, rerun, ncore."""
     run: Annotated[Path, tyro.conf.Positional, arg(metavar="RUN")]
     """Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory."""
     out: Annotated[Path, arg(metavar="OUT")]
-    """File to write, with the suffix of the format; for cameras and ros2, folder to write."""
+    """File to write, with the suffix of the format; for cameras, ros2 and ncore, folder to write."""
     scene: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Scene directory that a Gaussian scene was fitted to. A run has its own."""
     edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None

@@ -31,6 +31,7 @@ _OPTIONAL: Mapping[str, tuple[str, str]] = {
     "diffusers": ("Marigold in annotate", "pip install 'mudg[models]'"),
     "gsplat": ("faster rasteriser on CUDA devices", "pip install 'mudg[gsplat]'"),
     "zstandard": ("SPZ files of version 4", "pip install zstandard"),
+    "nvidia-ncore": ("recordings of NCore, both ways", "pip install 'mudg[ncore]'"),
     "rerun-sdk": ("recordings of export rerun", "pip install 'mudg[rerun]'"),
     "tensorboard": ("curves of learn --tensorboard", "pip install 'mudg[track]'"),
 }

@@ -57,17 +57,17 @@ class LogRecords:
         found = [(track, track.pose_at(time_s)) for track in self.scene.tracks]
         return [(track, pose) for track, pose in found if pose is not None]
 
-    def mounts(self) -> dict[str, Matrix]:
+    def mounts(self, tolerance_m: float = MOUNT_M) -> dict[str, Matrix]:
         """Ego-from-sensor f64[4, 4] of the sensors that do not move on the vehicle: ``camera/NAME``, ``lidar/NAME``.
 
-        A sensor whose recorded poses the vehicle's path does not explain to ``MOUNT_M`` is left out.
+        A sensor whose recorded poses the vehicle's path does not explain to ``tolerance_m`` is left out.
         """
         first: dict[str, Matrix] = {}
         moving: set[str] = set()
         for name, time_s, pose in self.sensor_poses():
             ego = self.scene.ego.pose_at(time_s)
             mount = None if ego is None else geometry.invert(ego) @ pose
-            if mount is None or np.abs(first.setdefault(name, mount) - mount).max() > MOUNT_M:
+            if mount is None or np.abs(first.setdefault(name, mount) - mount).max() > tolerance_m:
                 moving.add(name)
         return {name: mount for name, mount in first.items() if name not in moving}
 

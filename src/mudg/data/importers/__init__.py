@@ -21,7 +21,7 @@ Finder = Callable[[Path, ImportOptions], LogFiles]
 
 FORMATS = (
     "kitti360",  # before kitti: a drive's folder has image_00 in both
-    "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "custom", "kitti",
+    "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti",
 )  # fmt: skip
 """Names of the formats, in the order in which a folder is asked whether it looks like one."""
 
@@ -61,6 +61,10 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
             from mudg.data.importers.dgp import files_of_dgp, import_dgp, looks_like_dgp
 
             return looks_like_dgp, import_dgp, files_of_dgp
+        case "ncore":
+            from mudg.data.importers.ncore.importer import files_of_ncore, import_ncore, looks_like_ncore
+
+            return looks_like_ncore, import_ncore, files_of_ncore
         case "custom":
             from mudg.data.importers.custom.importer import import_custom, looks_like_custom
 
@@ -74,7 +78,10 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 
 
 def _import(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
-    return _functions(name)[1](source, out, options)
+    from mudg.data.importers.common import foreign_numbers
+
+    with foreign_numbers():
+        return _functions(name)[1](source, out, options)
 
 
 def _looks_like(name: str, source: Path) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -357,7 +358,10 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
         raise InputError("array is of a version that is not read", where=where, got=str(version))
-    shape, fortran, dtype = readers[version](handle)
+    try:
+        shape, fortran, dtype = readers[version](handle)
+    except (tokenize.TokenError, SyntaxError, RecursionError, MemoryError) as error:  # of the parser that numpy hands the header to
+        raise InputError("array's header makes no sense", where=where, got=str(error)[:120], remedy="copy the file again") from error
     length = math.prod(shape) * dtype.itemsize
     if (
         dtype.hasobject

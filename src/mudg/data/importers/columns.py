@@ -65,6 +65,6 @@ def arrow_files(path: Path) -> Iterator[None]:
             remedy="pip install 'mudg[data]'") from error  # fmt: skip
     try:
         yield
-    except (pyarrow.ArrowException, OSError, MemoryError, StopIteration) as error:
+    except (pyarrow.ArrowException, OSError, MemoryError, StopIteration, UnicodeDecodeError) as error:
         raise InputError("table cannot be read, or is cut off", where=str(path), remedy="copy the file again",
             got=str(error)[:200] or "it ends early") from error  # fmt: skip

@@ -123,9 +123,16 @@ def for_each(
     return done
 
 
+def foreign_numbers() -> np.errstate:
+    """Code that reads numbers of others: values that overflow or are none stay silent, because what comes out is checked. Holds in the
+    thread that enters it."""
+    return np.errstate(over="ignore", invalid="ignore")
+
+
 def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]) -> None:
     try:
-        work(item)
+        with foreign_numbers():
+            work(item)
     except MudgError as error:
         called = name(item)
         if called in error.where:

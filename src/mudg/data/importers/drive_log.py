@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers.box_times import REACH_S, BoxTimes, clip_track, reach_images
 from mudg.data.importers.common import check_motion, for_each, nearest_index, world_from_first
-from mudg.data.importers.images import ImageFit, fit_images, image_notes
+from mudg.data.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.data.importers.options import ImportOptions, holdout_split
 from mudg.data.scene import SceneWriter
 
@@ -158,23 +158,37 @@ def _log_notes(dataset: str, notes: Iterable[str]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
-    """One recorded image: ``map_from_cam`` f64[4, 4] at its own time."""
+    """One recorded image: ``map_from_cam`` f64[4, 4] at its own time. ``read``: its bytes, where it is no file of its own; ``place``
+    names it then, for errors, and ``path`` is the file that holds it."""
 
     camera: str
     time_s: float
     map_from_cam: Matrix
     path: Path
+    read: Callable[[], bytes] | None = None
+    place: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepRecord:
-    """One LiDAR sweep: ``map_from_lidar`` f64[4, 4] at its time; ``read`` loads the points when they are wanted."""
+    """One LiDAR sweep: ``map_from_lidar`` f64[4, 4] at its time; ``read`` loads the points when they are wanted. ``place`` as above."""
 
     sensor: str
     time_s: float
     map_from_lidar: Matrix
     path: Path
     read: Callable[[], SweepPoints]
+    place: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraOptics:
+    """What a camera's images need besides its intrinsics: ``lens``, if they are not rectified, and where they show the recording vehicle,
+    ``ego`` bool[H, W] of the recorded size."""
+
+    recorded: Camera
+    lens: Lens | None = None
+    ego: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,6 +204,8 @@ class DriveLog:
         ego: the vehicle's path in the map's frame.
         source: data set, licence and notes.
         where: folder, for messages.
+        optics: by scene name; cameras that are not named are rectified.
+        box_times: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes; ``own``: the boxes' own.
     """
 
     name: str
@@ -201,6 +217,8 @@ class DriveLog:
     ego: EgoPath
     source: Source
     where: str
+    optics: Mapping[str, CameraOptics] = field(default_factory=dict)
+    box_times: Literal["sweeps", "own"] = "sweeps"
 
 
 def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
@@ -221,7 +239,9 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     numbers = _numbers_in_time_order(records)
     ego = _ego_between(drive.ego, start_s, end_s, drive.where)
     world_from_map = world_from_first(ego.world_from_ego[0])
-    fits = {name: fit_images(camera, options) for name, camera in drive.cameras.items()}
+    optics = {name: drive.optics.get(name, CameraOptics(camera)) for name, camera in drive.cameras.items()}
+    fits = {name: fit_images(drive.cameras[name], options, one.lens) for name, one in optics.items()}
+    labels = {name: {} if one.ego is None else {"ego": fits[name].ids(one.ego)} for name, one in optics.items()}
     within = (start_s - REACH_S, end_s + REACH_S)
     seen = BoxTimes([track for track in drive.tracks if clip_track(track, *within) is not None])
     notes = [*drive.source.notes, *image_notes(fits)]
@@ -231,15 +251,17 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
         notes.append(f"frames {options.frames[0]} to {options.frames[1] - 1} of camera {drive.reference}")
 
     def convert(record: ImageRecord | SweepRecord) -> Iterable[SceneImage | SceneSweep]:
-        time_s, where = record.time_s - start_s, str(record.path)
+        time_s, where = record.time_s - start_s, _place(record)
         if isinstance(record, ImageRecord):
             pose, moment = world_from_map @ record.map_from_cam, chosen.images[record]
-            yield SceneImage(record.camera, numbers[record], time_s, pose, record.path, where, moment=moment)
+            image = record.path if record.read is None else record.read()
+            yield SceneImage(record.camera, numbers[record], time_s, pose, image, where, labels[record.camera], moment)
             return
         points = record.read()
         if options.untwist == "no":
             points = replace(points, dt_s=np.zeros_like(points.dt_s))
-        seen.observe(record.time_s, record.map_from_lidar, points)
+        if drive.box_times == "sweeps":
+            seen.observe(record.time_s, record.map_from_lidar, points)
         pose = world_from_map @ record.map_from_lidar
         yield SceneSweep(record.sensor, numbers[record], time_s, pose, points, where)
 
@@ -253,8 +275,12 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
 
     path = EgoPath(ego.times_s - start_s, world_from_map @ ego.world_from_ego)
     source = replace(drive.source, notes=tuple(notes))
-    content = SceneContent(drive.name, source, fits, records, convert, lambda record: str(record.path), path, tracks)
+    content = SceneContent(drive.name, source, fits, records, convert, _place, path, tracks)
     return write_scene(content, out, options)
+
+
+def _place(record: ImageRecord | SweepRecord) -> str:
+    return record.place or str(record.path)
 
 
 def _sensor_of(record: ImageRecord | SweepRecord) -> str:

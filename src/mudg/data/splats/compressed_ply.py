@@ -109,16 +109,14 @@ def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
     if table is None:
         return np.zeros((count, 0, 3))
     names = table.dtype.names or ()
+    rest = tuple(f"f_rest_{index}" for index in range(len(names)))
     if len(table) != count or len(names) not in _REST or any(table.dtype[name] != np.uint8 for name in names):
         raise InputError("the harmonics of the compressed PLY do not fit its vertices", where=where,
             expected=f"{count} rows of 9, 24 or 45 uchar", got=f"{len(table)} rows of {len(names)}")  # fmt: skip
-    raw = (
-        ply.columns_of(table, tuple(f"f_rest_{index}" for index in range(len(names)))) if "f_rest_0" in names else None
-    )
-    if raw is None:
-        raise InputError(
-            "the harmonics of the compressed PLY have unknown names", where=where, got=", ".join(names[:4])
-        )
+    unknown = sorted(set(names) - set(rest))
+    if unknown:
+        raise InputError("the harmonics of the compressed PLY have unknown names", where=where, got=", ".join(unknown[:4]))
+    raw = ply.columns_of(table, rest)
     values = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
     return ply.coefficient_major(((values - 0.5) * 8).astype(np.float32)).astype(np.float64)
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
-from mudg.data.splats import bundle, compressed_ply, gltf, gltf_read, ply, sog, splat, spz, usd
+from mudg.core.ground import HeightMap
+from mudg.data.splats import alpasim, bundle, compressed_ply, gltf, gltf_read, ply, sog, splat, spz, usd
 from mudg.data.splats.cloud import SplatCloud, SplatNode, SplatScene
 
 Axes = Literal["viewer", "world"]
@@ -33,13 +34,14 @@ class WriteRequest:
 
     Args:
         scene: with the axes of the file. time_s: the moment, or None = all of the motion. spz_version: 3 or 4. log: whose cameras are
-            listed, where a format can.
+            listed, where a format can. ground: where a format needs it.
     """
 
     scene: SplatScene
     time_s: float | None
     spz_version: int = 3
     log: Scene | None = None
+    ground: HeightMap | None = None
 
     @property
     def cloud(self) -> SplatCloud:
@@ -87,6 +89,8 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
                         frozenset({"harmonics", "motion", "deformation", "classes"})),
     "usdz": SplatFormat((".usdz",), "z up", lambda r: usd.to_package(r.scene, r.time_s, r.log), None,
                         frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
+    "alpasim": SplatFormat((".usdz",), "z up", lambda r: alpasim.to_package(r.scene, r.log, r.ground), None,
+                           frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
     "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "right, down, forward", lambda r: compressed_ply.to_bytes(r.cloud),
                                   compressed_ply.from_bytes),
     "sog": SplatFormat((".sog",), "right, down, forward", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
@@ -138,7 +142,9 @@ def read_cloud(content: bytes, name: str, axes: Axes = "viewer") -> tuple[SplatC
     read = FORMATS[found].read
     if read is None:  # no mark leads here
         raise InputError("files of this format are not read", where=name, got=found)
-    return read(content, name).moved(geometry.invert(file_from_world(found, axes))), found
+    with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
+        cloud = read(content, name)
+    return cloud.moved(geometry.invert(file_from_world(found, axes))), found
 
 
 def losses(name: str, request: WriteRequest) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -67,8 +67,10 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, l
     return "\n".join([*lines, "}", ""]).encode()
 
 
-def to_package(scene: SplatScene, time_s: float | None = None, log: Scene | None = None) -> bytes:
-    """A scene as a USDZ package: the text, and the sky as a picture (zenith on top, as one looks at it).
+def to_package(
+    scene: SplatScene, time_s: float | None = None, log: Scene | None = None, more: Mapping[str, bytes] | None = None
+) -> bytes:
+    """A scene as a USDZ package: the text, the sky as a picture (zenith on top, as one looks at it), and ``more`` files after these.
 
     Raises:
         InputError: more than 4 GiB, which a package cannot hold.
@@ -76,6 +78,7 @@ def to_package(scene: SplatScene, time_s: float | None = None, log: Scene | None
     files = {"scene.usda": to_text(scene, time_s, scene.sky is not None, log)}
     if scene.sky is not None:
         files[SKY_FILE] = png(scene.sky[:, ::-1])
+    files |= dict(more or {})
     size = sum(map(len, files.values()))
     if size > _MOST_PACKAGE - (1 << 20):
         raise InputError("the scene is too large for a USDZ package", expected="below 4 GiB", got=f"{size} bytes",

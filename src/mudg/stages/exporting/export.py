@@ -2,7 +2,8 @@
 
 Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
 cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
-messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2)
+messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2),
+            OUT/NAME.ncore4.zarr.itar (NCore)
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import PointCloud, Scene
 from mudg.base.versions import version
+from mudg.core.ground import HeightMap
 from mudg.core.sh import C0
 from mudg.data.cloudfile import read_fused
 from mudg.data.exporters.colmap import colmap_files
@@ -29,11 +31,13 @@ from mudg.data.exporters.pictures import picture_names, pictures
 from mudg.data.scene import read_scene
 from mudg.data.splats.cloud import SplatScene
 from mudg.data.splats.formats import FORMATS, WriteRequest, file_from_world, losses
+from mudg.models.scene.edited import lowest_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import ExportConfig
+from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.carried import carry_out, read_and_digest
 from mudg.stages.editing.runs import RunParts, find_run
-from mudg.stages.exporting.messages import BAG, Told, records_of, refuse_missing, write_bag, write_file
+from mudg.stages.exporting.messages import FOLDERS, Told, records_of, refuse_missing, write_file, write_folder
 from mudg.stages.exporting.messages import SUFFIXES as MESSAGES
 from mudg.stages.exporting.scenes import splat_scene, with_sky_sphere
 from mudg.stages.fitting.storage import load_model, model_of_scene
@@ -43,6 +47,7 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
     "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
 }  # fmt: skip
 """Formats of cameras: files beside the pictures."""
+_ALL_MOMENTS: Final = ("bundle", "alpasim")
 MOST_POINTS: Final = 500_000
 _FOLDER = VerbOutput("export", 1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
 
@@ -85,10 +90,10 @@ def run(
     refuse_missing(name)
     given = _opened(source, scene, edits, name in FORMATS)
     refuse_overlap(out, {"scene": given.parts.scene, **given.named})
-    if cameras or name == "ros2":
+    if cameras or name in FOLDERS:
         recorded, settings = _known(given), {**result_settings(config), "format": name}
-        folder = RunDir.open(out, _FOLDER if cameras else BAG, settings, given.inputs, overwrite)
-        return _cameras(name, given, recorded, folder) if cameras else write_bag(records_of(recorded, _points(given)), folder)
+        folder = RunDir.open(out, _FOLDER if cameras else FOLDERS[name], settings, given.inputs, overwrite)
+        return _cameras(name, given, recorded, folder) if cameras else write_folder(name, records_of(recorded, _points(given)), folder)
     _refuse_name(out, name, overwrite)
     if name in MESSAGES:
         return _messages(config, name, given, Path(out))
@@ -109,8 +114,8 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
         raise UsageError(
             "this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s"
         )
-    if name == "bundle" and config.time_s is not None:
-        raise UsageError("a bundle holds all moments", where="--time-s", remedy="leave it out, or export ply")
+    if name in _ALL_MOMENTS and config.time_s is not None:
+        raise UsageError("a file of this format holds all moments", where="--time-s", got=name, remedy="leave it out, or export ply")
     set_here = [
         key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
     ]
@@ -188,7 +193,18 @@ def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log)
+    ground = _ground(given) if name == "alpasim" else None
+    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log, ground)
+
+
+def _ground(given: Exported) -> HeightMap | None:
+    """The height of the ground, by classes of points or Gaussians, else by the lowest Gaussians."""
+    if given.model is None:
+        return None
+    cloud = None if given.parts.fused is None else read_fused(given.parts.fused)
+    found = ground_of(cloud, given.model)
+    lowest = lowest_points(given.model) if found is None else ()
+    return HeightMap.from_points(np.asarray(lowest)) if len(lowest) else found
 
 
 def middle_s(model: SceneModel, recorded: Scene | None) -> float:

@@ -1,4 +1,4 @@
-"""A log as messages over time: files of Foxglove and rerun, bags of ROS 2."""
+"""A log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from mudg.base import log, store
 from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import Scene
 from mudg.base.versions import version
-from mudg.data.exporters import ros2
+from mudg.data import ncore as ncore_package
+from mudg.data.exporters import ncore, ros2
 from mudg.data.exporters.foxglove import DIALECT, FoxgloveMessages
 from mudg.data.exporters.log_records import LogRecords
 from mudg.data.exporters.mcap import McapBlocks
@@ -19,9 +20,10 @@ from mudg.data.scene import read_points
 from mudg.data.scene.files import open_files
 from mudg.data.splats.cloud import SplatScene
 
-SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": ""}
+SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
-BAG: Final = VerbOutput("export", 1, (ros2.METADATA, ros2.FILE))
+FOLDERS: Final = {"ros2": VerbOutput("export", 1, (ros2.METADATA, ros2.FILE)), "ncore": VerbOutput("export", 1, ncore.FILES)}
+"""What formats that are folders consist of."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +54,8 @@ def refuse_missing(name: str) -> None:
     """ResourceError if the package of a format is not installed."""
     if name == "rerun":
         package()
+    elif name == "ncore":
+        ncore_package.package()
 
 
 def write_file(name: str, told: Told, out: Path) -> Path:
@@ -65,19 +69,33 @@ def write_file(name: str, told: Told, out: Path) -> Path:
     return out
 
 
-def write_bag(records: LogRecords, folder: RunDir) -> Path:
-    """Write a log as a bag of ROS 2."""
+def write_folder(name: str, records: LogRecords, folder: RunDir) -> Path:
+    """Write a log as a folder: ``ros2`` or ``ncore``."""
     if folder.complete:
         return folder.reused()
     try:
-        blocks = McapBlocks(ros2.Ros2Messages(records), f"mudg {version()}", ros2.dialect())
-        store.write_blocks(folder.path / ros2.FILE, blocks)
+        content, summary = _bag(records, folder.path) if name == "ros2" else _recording(records, folder.path)
     except KeyboardInterrupt:
         folder.pause()
         raise
-    store.atomic_write(folder.path / ros2.METADATA, ros2.metadata(blocks.topics, blocks.span))
-    size = (folder.path / ros2.FILE).stat().st_size
-    count = sum(number for _, number in blocks.topics.values())
-    folder.finish({"format": "ros2", "messages": count})
-    log.info(f"export: {Told(records).summary}, {count} messages, {size / 1e6:.2f} MB in {folder.path}")
+    size = content.stat().st_size
+    folder.finish({"format": name, **summary})
+    told = "".join(f", {count} {what}" for what, count in summary.items())
+    log.info(f"export: {Told(records).summary}{told}, {size / 1e6:.2f} MB in {folder.path}")
     return folder.path
+
+
+def _bag(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
+    """A bag of ROS 2: its largest file, and what to say of it."""
+    blocks = McapBlocks(ros2.Ros2Messages(records), f"mudg {version()}", ros2.dialect())
+    store.write_blocks(folder / ros2.FILE, blocks)
+    store.atomic_write(folder / ros2.METADATA, ros2.metadata(blocks.topics, blocks.span))
+    return folder / ros2.FILE, {"messages": sum(number for _, number in blocks.topics.values())}
+
+
+def _recording(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
+    """A recording of NCore."""
+    rolling = [name for name, camera in records.scene.cameras.items() if camera.readout_s > 0]
+    if rolling:
+        log.warn(f"export: a scene does not know which way the shutters of {', '.join(rolling)} roll; ncore says downwards")
+    return ncore.write_ncore(folder, records)[0], {"boxes": len(records.scene.tracks)}

@@ -1,0 +1,132 @@
+"""What writing and reading NCore files (version 4 of NVIDIA's format of recordings) share: the package, names, rotations of boxes, poses
+between keys.
+
+Conventions, as the package's own functions apply them: world right-handed with z up; rig x forward, y left, z up; cameras x right, y down,
+z forward, the centre of the top-left pixel at (0.5, 0.5); times in whole microseconds; between keys poses move in straight lines and rotate
+evenly. A LiDAR's rays are directions in the sensor's frame at their own time. A box is turned about x, then y, then z of the fixed frame.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from mudg.base.errors import ResourceError
+from mudg.base.geometry import from_rotation_translation
+
+Matrix = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+RIG: Final = "rig"
+WORLD: Final = "world"
+INSTANCE: Final = "default"
+"""Name of a component of which a recording has one: poses, intrinsics, masks, boxes."""
+EGO_MASK: Final = "ego"
+"""Mask of a camera that is not 0 where the recording vehicle is seen."""
+MARK: Final = ".ncore4"
+"""What stands in the names of the files, after the name of the recording."""
+ABOUT: Final = "mudg"
+"""Key of what this program notes about a recording."""
+SWEEP_TIME: Final = "sweep_timestamp_us"
+"""Key of the moment of a sweep, of which the format knows only begin and end."""
+POINT_CLASSES: Final = "train_ids"
+MICRO: Final = 1_000_000
+_EULER: Final = "xyz"  # small letters: about fixed axes
+
+
+@dataclass(frozen=True, slots=True)
+class NCorePackage:
+    """The modules of the package ``nvidia-ncore``: ``data`` (types), ``v4`` (files), ``sensors`` (projection)."""
+
+    data: Any
+    v4: Any
+    sensors: Any
+    transformations: Any
+
+
+def package() -> NCorePackage:
+    """The package, loaded when it is first asked for.
+
+    Raises:
+        ResourceError: it is not installed.
+    """
+    try:
+        data, files = importlib.import_module("ncore.data"), importlib.import_module("ncore.data.v4")
+        sensors = importlib.import_module("ncore.sensors")
+        return NCorePackage(data, files, sensors, importlib.import_module("ncore.impl.common.transformations"))
+    except ImportError as error:
+        raise ResourceError("NCore files need the package nvidia-ncore, which is not installed",
+            got=str(error), remedy="pip install 'mudg[ncore]'") from error  # fmt: skip
+
+
+def close(reader: Any) -> None:
+    """Close the files of a ``SequenceComponentGroupsReader``, for which the package has no call."""
+    for group, _ in reader._component_stores.values():
+        files = getattr(group.store, "store", group.store)  # below what holds the consolidated metadata
+        if hasattr(files, "close"):
+            files.close()
+
+
+def euler_of(rotation: Matrix) -> tuple[float, float, float]:
+    """The three angles in radians of a box's rotation f64[3, 3]."""
+    x, y, z = Rotation.from_matrix(rotation).as_euler(_EULER)
+    return float(x), float(y), float(z)
+
+
+def rotation_of(euler_rad: tuple[float, float, float]) -> Matrix:
+    """The rotation f64[3, 3] of a box's three angles."""
+    return Rotation.from_euler(_EULER, euler_rad).as_matrix()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseKeys:
+    """A frame's poses over time.
+
+    Args:
+        times_us: i64[K], increasing, at least two. poses: f64[K, 4, 4], rigid.
+    """
+
+    times_us: Times
+    poses: Matrix
+
+    def at(self, times_us: Times) -> Matrix:
+        """Poses f64[N, 4, 4] at times i64[N] from the first to the last key."""
+        turned = Slerp(self.times_us, Rotation.from_matrix(self.poses[:, :3, :3]))(times_us)
+        after = np.clip(np.searchsorted(self.times_us, times_us), 1, len(self.times_us) - 1)
+        span = self.times_us[after] - self.times_us[after - 1]
+        share = ((times_us - self.times_us[after - 1]) / span)[:, None]
+        poses = np.tile(np.eye(4), (len(times_us), 1, 1))
+        poses[:, :3, :3] = turned.as_matrix()
+        poses[:, :3, 3] = (1 - share) * self.poses[after - 1, :3, 3] + share * self.poses[after, :3, 3]
+        return poses
+
+    def covering(self, start_us: int, end_us: int) -> PoseKeys:
+        """With keys at both ends of a span of time, where it reaches beyond: the frame goes on as it did between its two nearest keys, for
+        no longer than these lie apart, and then stands."""
+        times, poses = [*self.times_us.tolist()], [*self.poses]
+        if start_us < times[0]:
+            poses.insert(
+                0, _beyond(times[1] - times[0], poses[1], poses[0], times[0] - start_us) if len(times) > 1 else poses[0]
+            )
+            times.insert(0, start_us)
+        if end_us > times[-1]:
+            poses.append(
+                _beyond(times[-1] - times[-2], poses[-2], poses[-1], end_us - times[-1])
+                if len(times) > 1
+                else poses[-1]
+            )
+            times.append(end_us)
+        return PoseKeys(np.array(times, np.int64), np.stack(poses))
+
+
+def _beyond(step_us: int, before: Matrix, last: Matrix, beyond_us: int) -> Matrix:
+    """Where a frame is some time after its last key."""
+    share = min(beyond_us / step_us, 1.0)
+    turn = Rotation.from_matrix(last[:3, :3]) * Rotation.from_matrix(before[:3, :3]).inv()
+    rotation = Rotation.from_rotvec(share * turn.as_rotvec()) * Rotation.from_matrix(last[:3, :3])
+    return from_rotation_translation(rotation.as_matrix(), last[:3, 3] + share * (last[:3, 3] - before[:3, 3]))

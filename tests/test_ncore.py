@@ -1,0 +1,594 @@
+"""NCore recordings both ways: what is written means the same to NVIDIA's own functions, comes back as it was, and damage is told."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import lzma
+import shutil
+import struct
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import roundtrip
+from memory_limits import at_most
+from roundtrip import needs_native
+
+from mudg import cli
+from mudg.base import geometry
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
+from mudg.data.exporters.log_records import LogRecords
+from mudg.data.exporters.ncore import sensor_ids, write_ncore
+from mudg.data.importers import IMPORTERS, RECOGNISERS
+from mudg.data.importers.images import brown_conrady, equidistant, fit_images
+from mudg.data.importers.ncore import container, importer
+from mudg.data.importers.options import ImportOptions
+from mudg.data.ncore import PoseKeys, euler_of, package, rotation_of
+from mudg.data.scene import read_label, read_points
+from mudg.data.scene.files import open_files
+
+try:
+    package()
+    REASON = ""
+except ResourceError as missing:
+    REASON = str(missing)
+needs_package = pytest.mark.skipif(bool(REASON), reason="the package nvidia-ncore is not installed")
+pytestmark = [needs_native, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
+
+
+def ingest(source: Path, out: Path, **options: Any) -> Scene:
+    return IMPORTERS["ncore"](source, out, ImportOptions(**options))
+
+
+def records(scene: Scene, **changes: Any) -> LogRecords:
+    files = open_files(scene.root)
+    return LogRecords(
+        replace(scene, **changes), lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep)
+    )
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
+
+
+@pytest.fixture(scope="module")
+def recording(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    write_ncore(folder, records(truth))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def loaded(recording: Path) -> Any:
+    v4 = package().v4
+    return v4.SequenceLoaderV4(v4.SequenceComponentGroupsReader(sorted(recording.glob("*.json"))))
+
+
+# --- what it means to the package -----------------------------------------------------------------------------------
+
+
+@needs_package
+def test_points_fall_on_their_pixels_by_the_packages_own_projection(truth: Scene, loaded: Any) -> None:
+    """Pixel centres, camera axes and the direction of every pose: the package projects as this program does."""
+    import torch
+
+    points = np.random.default_rng(0).uniform([8, -12, -1], [30, 12, 4], (200, 3))
+    for index, frame in enumerate(truth.frames_of("front_left")):
+        sensor = loaded.get_camera_sensor("front_left")
+        model = package().sensors.CameraModel.from_parameters(
+            sensor.model_parameters, device="cpu", dtype=torch.float64
+        )
+        at = sensor.frames_timestamps_us[index].astype(np.uint64)
+        assert at[0] == at[1] == round(frame.view.time_s * 1e6) - round(truth.ego.times_s[0] * 1e6) + 1_000_000
+        pose = loaded.pose_graph.evaluate_poses("world", "front_left", at[1])
+        world = geometry.transform_points(frame.view.world_from_cam, points[:, [1, 2, 0]] * [1, -1, 1])
+        theirs = model.world_points_to_image_points_static_pose(world, pose, return_valid_indices=True)
+        uv, _ = geometry.project(frame.view, world)
+        seen = np.asarray(theirs.valid_indices)
+        assert len(seen) > 20
+        assert np.abs(np.asarray(theirs.image_points) - uv[seen]).max() < 1e-3
+        assert np.asarray(model.pixels_to_image_points(np.zeros((1, 2), np.int32))).tolist() == [[0.5, 0.5]]
+
+
+@needs_package
+def test_sweeps_compensated_by_the_package_are_the_sweeps(truth: Scene, loaded: Any) -> None:
+    lidar = loaded.get_lidar_sensor("lidar")
+    for index, sweep in enumerate(truth.sweeps):
+        cloud = lidar.get_frame_point_cloud(index, motion_compensation=True, with_start_points=False)
+        end = lidar.frames_timestamps_us[index, 1]
+        pose = loaded.pose_graph.evaluate_poses("lidar", "world", np.array(end))
+        found = geometry.transform_points(pose, np.asarray(cloud.xyz_m_end, np.float64))
+        given = read_points(truth, sweep)
+        expected = geometry.transform_points(sweep.world_from_lidar, given.xyz.astype(np.float64))
+        assert np.abs(found - expected).max() < 1e-3
+        raw = lidar.get_frame_point_cloud(index, motion_compensation=False, with_start_points=False).xyz_m_end
+        assert np.abs(raw - given.xyz).max() > 0.01  # as measured, not as compensated
+
+
+@needs_package
+def test_boxes_stand_where_the_package_puts_them(truth: Scene, loaded: Any) -> None:
+    bbox_pose = package().transformations.bbox_pose
+    found = list(loaded.get_cuboid_track_observations())
+    assert {one.track_id for one in found} == {track.id for track in truth.tracks}
+    zero = loaded.generic_meta_data["mudg"]["clock_zero_us"]
+    for one in found:
+        track = truth.track(one.track_id)
+        expected = track.pose_at((one.timestamp_us - zero) / 1e6)
+        assert expected is not None
+        assert one.class_id == track.label and one.bbox3.dim == tuple(track.size_m)
+        assert (
+            np.abs(bbox_pose(np.array([*one.bbox3.centroid, *one.bbox3.dim, *one.bbox3.rot])) - expected).max() < 1e-9
+        )
+        assert one.source.name == "GT_SYNTHETIC"
+
+
+def test_angles_of_boxes_turn_about_fixed_axes() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        x, y, z = rng.uniform(-1.4, 1.4, 3)
+        turn = geometry.yaw_matrix(z)[:3, :3] @ _about(1, y) @ _about(0, x)
+        assert np.allclose(rotation_of((x, y, z)), turn, atol=1e-12)
+        assert np.allclose(euler_of(turn), (x, y, z), atol=1e-12)
+
+
+def _about(axis: int, angle: float) -> np.ndarray:
+    """A right-handed turn about x (0) or y (1)."""
+    turn, (a, b) = np.eye(3), ((1, 2), (2, 0))[axis]
+    turn[a, a] = turn[b, b] = np.cos(angle)
+    turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
+    return turn
+
+
+# --- both ways --------------------------------------------------------------------------------------------------------
+
+
+@needs_package
+def test_round_trip(truth: Scene, recording: Path, tmp_path: Path) -> None:
+    """Images equal to the byte, poses to 1e-6, points to 0.1 mm, boxes to 1e-6, times to a nanosecond."""
+    assert RECOGNISERS["ncore"](recording)
+    scene = ingest(recording, tmp_path / "back")
+    roundtrip.assert_same_log(scene, truth, time_s=1e-9, intrinsics_px=1e-5, dt_s=1e-6, intensity=1e-6, cloud_m=1e-4)
+    for a, b in zip(truth.frames, scene.frames, strict=True):
+        assert open_files(truth.root).read(a.image.path) == open_files(scene.root).read(b.image.path)
+    assert scene.source.dataset == truth.source.dataset and scene.source.licence == truth.source.licence
+    assert scene.id == truth.id
+
+
+@needs_package
+def test_the_same_log_gives_the_same_bytes(truth: Scene, recording: Path, tmp_path: Path) -> None:
+    for path in write_ncore(tmp_path, records(truth)):
+        assert path.read_bytes() == (recording / path.name).read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in recording.iterdir())
+
+
+@needs_package
+def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Path) -> None:
+    """What the city does not have: a rolling shutter, a camera that shakes on the vehicle, the own bonnet, classes of points."""
+    rng = np.random.default_rng(2)
+    cameras = {**truth.cameras, "front": replace(truth.cameras["front"], readout_s=0.03)}
+    bonnet = np.zeros((64, 96), bool)
+    bonnet[50:, 20:70] = True
+
+    def changed(frame: Frame) -> Frame:
+        camera: Camera = cameras[frame.view.camera.name]
+        pose = frame.view.world_from_cam.copy()
+        if camera.name == "front_left":
+            pose[:3, 3] += rng.normal(0, 0.02, 3)
+        return replace(frame, view=replace(frame.view, camera=camera, world_from_cam=pose))
+
+    shaken = replace(truth, cameras=cameras, frames=tuple(map(changed, truth.frames)))
+    classes = {s.id: rng.integers(0, 19, len(read_points(truth, s).xyz)).astype(np.uint8) for s in truth.sweeps}
+
+    def points(sweep: Any) -> SweepPoints:
+        return replace(read_points(truth, sweep), classes=classes[sweep.id])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mudg.data.exporters.ncore.read_label", lambda *_: bonnet)
+        labelled = tuple(replace(frame, labels={"ego": frame.image}) for frame in shaken.frames)
+        write_ncore(tmp_path, LogRecords(replace(shaken, frames=labelled), records(truth).picture, points))
+    scene = ingest(tmp_path, tmp_path / "back")
+    assert scene.cameras["front"].readout_s == 0.03 and scene.cameras["front_left"].readout_s == 0.0
+    assert any("rolling top to bottom shutter" in note for note in scene.source.notes)
+    shift = scene.frames[0].view.time_s - shaken.frames[0].view.time_s
+    world = scene.frames[0].view.world_from_cam @ geometry.invert(shaken.frames[0].view.world_from_cam)
+    for a, b in zip(shaken.frames, scene.frames, strict=True):
+        assert np.abs(b.view.world_from_cam - world @ a.view.world_from_cam).max() < 1e-6
+        assert b.view.time_s - a.view.time_s == pytest.approx(shift, abs=1e-9)
+        assert (read_label(scene, b, "ego") == bonnet).all()
+    for a, b in zip(truth.sweeps, scene.sweeps, strict=True):
+        found = read_points(scene, b).classes
+        assert found is not None and (found == classes[a.id]).all()
+
+
+@needs_package
+def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
+    """Stores per sensor, single-precision poses, boxes told in a sensor's frame, a lens, two returns: as NVIDIA's converters write."""
+    v4, data = package().v4, package().data
+    interval = package().transformations.HalfClosedInterval(1_000_000, 1_400_001)
+    writer = v4.SequenceComponentGroupsWriter(tmp_path, "clip", "clip-7", interval, {}, store_type="directory")
+    poses = writer.register_component_writer(v4.PosesComponent.Writer, "mine")
+    keys = np.array([1_000_000, 1_200_000, 1_400_000], np.uint64)
+    path = np.stack([geometry.yaw_matrix(0.1 * n, (float(n), 0, 0)) for n in range(3)]).astype(np.float32)
+    poses.store_dynamic_pose("rig", "world", path, keys)
+    mount = geometry.from_rotation_translation(geometry.CAM_FROM_EGO_AXES[:3, :3].T, (1.5, 0.0, 1.4)).astype(np.float32)
+    poses.store_static_pose("camera:front wide", "rig", mount)
+    poses.store_static_pose("top", "rig", geometry.from_rotation_translation(np.eye(3), (0, 0, 2.0)).astype(np.float32))
+    intrinsics = writer.register_component_writer(v4.IntrinsicsComponent.Writer, "mine")
+    intrinsics.store_camera_intrinsics("camera:front wide", data.OpenCVPinholeCameraModelParameters(
+        resolution=np.array([96, 64], np.uint64), shutter_type=data.ShutterType.ROLLING_LEFT_TO_RIGHT, external_distortion_parameters=None,
+        principal_point=np.array([48, 32], np.float32), focal_length=np.array([80, 80], np.float32),
+        radial_coeffs=np.array([-0.2, 0.02, 0, 0, 0, 0], np.float32), tangential_coeffs=np.zeros(2, np.float32),
+        thin_prism_coeffs=np.zeros(4, np.float32)))  # fmt: skip
+    camera = writer.register_component_writer(v4.CameraSensorComponent.Writer, "camera:front wide", "front")
+    image = open_files(truth.root).read(truth.frames[0].image.path)
+    for end in (1_100_000, 1_300_000):
+        camera.store_frame(image, "png", np.array([end - 20_000, end], np.uint64), {}, {})
+    lidar = writer.register_component_writer(v4.LidarSensorComponent.Writer, "top", "top")
+    rays = np.array([[1, 0, 0], [0, 1, 0], [0, 0, -1]], np.float32)
+    distance = np.array([[10, 20, np.nan], [12, np.nan, np.nan]], np.float32)
+    times, span = np.array([1_200_000, 1_250_000, 1_300_000], np.uint64), np.array([1_200_000, 1_300_000], np.uint64)
+    lidar.store_frame(rays, times, None, distance, (0 * distance + 0.5).astype(np.float32), span, {}, {})
+    box = data.BBox3((8.0, 1.0, -1.0), (4.5, 1.9, 1.6), (0.0, 0.0, 0.3))
+    writer.register_component_writer(v4.CuboidsComponent.Writer, "mine").store_observations(
+        [
+            data.CuboidTrackObservation("a", "automobile", at, "top", at, box, data.LabelSource.AUTOLABEL)
+            for at in (1_100_000, 1_300_000)
+        ]
+    )
+    writer.finalize()
+
+    scene = ingest(tmp_path, tmp_path / "back", test_every=0)
+    name = "camera_front_wide"
+    assert list(scene.cameras) == [name] and scene.cameras[name].readout_s == pytest.approx(0.02)
+    assert any("rectified" in note for note in scene.source.notes) and any(
+        "left to right" in note for note in scene.source.notes
+    )
+    assert scene.source.licence.startswith("not stated")
+    tree = package().transformations.PoseGraphInterpolator
+    roof = geometry.from_rotation_translation(np.eye(3), (0, 0, 2.0))
+    graph = tree([tree.Edge("rig", "world", path.astype(np.float64), keys), tree.Edge("top", "rig", roof, None)])
+    turned = [graph.evaluate_poses("top", "world", np.array(at)) for at in (1_200_000, 1_250_000, 1_100_000, 1_300_000)]
+    world = geometry.invert(_origin(scene, path, keys))
+    expected = np.stack(
+        [(turned[0] @ [10, 0, 0, 1])[:3], (turned[1] @ [0, 20, 0, 1])[:3], (turned[0] @ [12, 0, 0, 1])[:3]]
+    )
+    sweep = scene.sweeps[0]
+    found = geometry.transform_points(sweep.world_from_lidar, read_points(scene, sweep).xyz.astype(np.float64))
+    assert np.abs(found - geometry.transform_points(world, expected)).max() < 1e-5
+    (track,) = scene.tracks
+    assert track.label == "car"
+    for at, pose in zip((1_100_000, 1_300_000), turned[2:], strict=True):
+        stands = track.pose_at((at - 1_090_000) / 1e6)  # the first image is taken at 1.09 s
+        placed = world @ pose @ geometry.yaw_matrix(0.3, (8.0, 1.0, -1.0))
+        assert stands is not None and np.abs(stands - placed).max() < 1e-5
+
+
+@needs_package
+@pytest.mark.parametrize("kind", ["opencv-pinhole", "opencv-fisheye", "ftheta"])
+def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None:
+    """Projections against this program's own formulas; a lens of 120 degrees loses its rim, not its scale."""
+    data = package().data
+    size, point, focal = (
+        np.array([960, 604], np.uint64),
+        np.array([470, 310], np.float32),
+        np.array([440, 442], np.float32),
+    )
+    common = {
+        "resolution": size,
+        "shutter_type": data.ShutterType.GLOBAL,
+        "external_distortion_parameters": None,
+        "principal_point": point,
+    }
+    if kind == "opencv-pinhole":
+        radial, tangential = np.array([-0.1, 0.01, 0, 0, 0, 0], np.float32), np.array([1e-3, -2e-3], np.float32)
+        model = data.OpenCVPinholeCameraModelParameters(**common, focal_length=focal, radial_coeffs=radial, tangential_coeffs=tangential,
+                                                        thin_prism_coeffs=np.zeros(4, np.float32))  # fmt: skip
+        wanted = brown_conrady(*map(float, radial[:2]), *map(float, tangential))
+    elif kind == "opencv-fisheye":
+        bend = np.array([0.02, -0.003, 0, 0], np.float32)
+        model = data.OpenCVFisheyeCameraModelParameters(**common, focal_length=focal, radial_coeffs=bend, max_angle=1.3)
+        wanted = equidistant(*map(float, bend))
+    else:
+        model = data.FThetaCameraModelParameters(
+            **common, reference_poly=data.FThetaCameraModelParameters.PolynomialType.ANGLE_TO_PIXELDIST, max_angle=1.2,
+            pixeldist_to_angle_poly=np.array([0, 1 / 442, 0, 0, 0, 0], np.float32),
+            angle_to_pixeldist_poly=np.array([0, 442, 0, 0, 0, 0], np.float32),
+        )  # fmt: skip
+        wanted = equidistant()
+    like = model.paraxial_pinhole_geometry()
+    (fx, fy), (cx, cy) = like.focal_length.tolist(), like.principal_point.tolist()
+    camera = Camera("front", 960, 604, fx, fy, cx, cy)
+    lens = importer._lens(model, camera)
+    xy = np.random.default_rng(5).uniform(-0.8, 0.8, (100, 2))
+    assert np.abs(lens(xy) - wanted(xy)).max() < 1e-5
+    fit = fit_images(camera, ImportOptions(), lens)
+    assert 1.0 <= fit.camera.fx / camera.fx < 1.2 and (fit.camera.cx, fit.camera.cy) == (camera.cx, camera.cy)
+    if kind == "ftheta":  # centres of pixels count from 0 there
+        assert (camera.cx, camera.cy) == (470.5, 310.5)
+
+
+def _origin(scene: Scene, path: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """Of the scene's world, in the recording's: the vehicle's first key, level and along its heading."""
+    first = path[0].astype(np.float64)
+    assert np.abs(scene.ego.world_from_ego[0] - np.eye(4)).max() < 1e-6 and len(keys) == len(scene.ego.times_s)
+    return geometry.yaw_matrix(geometry.yaw_of(first), first[:3, 3])
+
+
+def test_names_of_sensors_are_apart() -> None:
+    assert sensor_ids(["front", "rig"], ["front", "world", "top"]) == {
+        "camera/front": "front", "camera/rig": "camera_rig", "lidar/front": "lidar_front", "lidar/world": "lidar_world", "lidar/top": "top",
+    }  # fmt: skip
+
+
+def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
+    keys = PoseKeys(np.array([100, 200]), np.stack([geometry.yaw_matrix(0.0), geometry.yaw_matrix(0.2, (1.0, 0, 0))]))
+    longer = keys.covering(50, 700)
+    assert longer.times_us.tolist() == [50, 100, 200, 700]
+    assert np.allclose(longer.poses[0], geometry.yaw_matrix(-0.1, (-0.5, 0, 0)))
+    assert np.allclose(longer.poses[-1], geometry.yaw_matrix(0.4, (2.0, 0, 0)))
+    assert np.allclose(longer.at(np.array([150]))[0], geometry.yaw_matrix(0.1, (0.5, 0, 0)))
+    assert np.allclose(longer.at(np.array([100, 200])), keys.poses)
+
+
+# --- choices and refusals -----------------------------------------------------------------------------------------------
+
+
+def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ncore.data", None)
+    (tmp_path / "a.ncore4.zarr.itar").write_bytes(b"")
+    with pytest.raises(ResourceError, match=r"mudg\[ncore\]"):
+        ingest(tmp_path, tmp_path / "out")
+    assert cli.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0
+    assert not (tmp_path / "out").exists()
+
+
+@needs_package
+def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None:
+    nowhere = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
+    with pytest.raises(InputError, match="vehicle's path"):
+        write_ncore(tmp_path, records(truth, ego=nowhere))
+    twice = replace(truth.frames[0], id="front/000099")
+    with pytest.raises(InputError, match="front/000099"):
+        write_ncore(tmp_path, records(truth, frames=(*truth.frames, twice)))
+    early = replace(truth, sweeps=truth.sweeps[:1])
+    reads = records(early)
+    late = LogRecords(
+        early, reads.picture, lambda sweep: replace(reads.points(sweep), dt_s=reads.points(sweep).dt_s - 3)
+    )
+    with pytest.raises(InputError, match="more than a second"):
+        write_ncore(tmp_path, late)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_package
+def test_one_vehicle_pose_and_no_sweep_are_enough(truth: Scene, tmp_path: Path) -> None:
+    still = EgoPath(truth.ego.times_s[:1], truth.ego.world_from_ego[:1])
+    alone = replace(truth, ego=still, sweeps=(), tracks=())
+    write_ncore(tmp_path, records(alone))
+    scene = ingest(tmp_path, tmp_path / "back")
+    roundtrip.assert_same_log(scene, alone, time_s=1e-9, intrinsics_px=1e-5)
+    assert "no LiDAR sweeps in the recording" in scene.source.notes
+
+
+@needs_package
+def test_one_of_several_recordings(recording: Path, tmp_path: Path) -> None:
+    (store,) = recording.glob("*.itar")
+    for name in ("a", "b"):
+        shutil.copy(store, tmp_path / f"{name}.ncore4.zarr.itar")
+    with pytest.raises(UsageError, match="--sequence"):
+        ingest(tmp_path, tmp_path / "out")
+    assert len(ingest(tmp_path, tmp_path / "out", sequence="b", cameras=("front",)).cameras) == 1
+    assert len(ingest(tmp_path / "a.ncore4.zarr.itar", tmp_path / "one").frames) == 10
+    listed = json.loads(next(recording.glob("*.json")).read_text())
+    listed["component_stores"][0]["path"] = "../a.ncore4.zarr.itar"
+    (tmp_path / "x.json").write_text(json.dumps(listed))
+    with pytest.raises(InputError, match="file name"):
+        ingest(tmp_path / "x.json", tmp_path / "two")
+
+
+@needs_package
+def test_the_commands(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    export = ["export", "ncore", truth.root, "--out", str(tmp_path / "out")]
+    assert cli.main(export) == 0
+    assert cli.main(export) == 0
+    assert "reused" in capsys.readouterr().err
+    assert cli.main(["ingest", str(tmp_path / "out"), str(tmp_path / "back"), "--no-contact-sheet"]) == 0
+
+
+# --- damage -----------------------------------------------------------------------------------------------------------
+
+
+def _itar(members: dict[str, bytes], metadata: dict[str, Any], index: dict[str, Any] | None = None) -> bytes:
+    """A store made by hand."""
+    import cbor2  # type: ignore[import-not-found]
+
+    members = {
+        **members,
+        ".zmetadata.cbor.xz": lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata})),
+    }
+    content, places = b"", []
+    for name, body in members.items():
+        places.append((name, len(content) + 512, len(body)))
+        content += b"\0" * 512 + body + b"\0" * (-len(body) % 512)
+    table = index or {
+        "items": [p[0] for p in places],
+        "offset_datas": [p[1] for p in places],
+        "sizes": [p[2] for p in places],
+    }
+    packed = lzma.compress(cbor2.dumps(table))
+    end = struct.pack("<4sIQI", b"itar", 1, len(content), len(packed)).ljust(512, b"\0")
+    return content + packed + b"\0" * (-len(packed) % 512) + end
+
+
+ROOT = {
+    ".zgroup": {"zarr_format": 2},
+    ".zattrs": {"version": "v4", "sequence_id": "a", "sequence_timestamp_interval_us": {"start": 0, "stop": 9}, "generic_meta_data": {},
+                "component_group_name": ""},
+}  # fmt: skip
+ARRAY = {
+    "zarr_format": 2,
+    "shape": [4],
+    "chunks": [4],
+    "dtype": "<f4",
+    "compressor": None,
+    "fill_value": 0,
+    "order": "C",
+    "filters": None,
+}
+
+
+def _hostile(kind: str) -> bytes:
+    import cbor2  # type: ignore[import-not-found]
+
+    metadata, members = {**ROOT, "x/.zarray": dict(ARRAY)}, {"x/0": bytes(16)}
+    if kind == "index bomb":
+        bomb = lzma.compress(bytes(200 << 20))
+        whole = bytes(512) + bomb
+        whole += bytes(-len(whole) % 512)
+        return whole + struct.pack("<4sIQI", b"itar", 1, 512, len(bomb)).ljust(512, b"\0")
+    if kind == "metadata bomb":
+        return _itar(members, {**metadata, "y/.zattrs": {"a": "0" * (150 << 20)}})
+    if kind == "huge array":
+        metadata["x/.zarray"] = {**ARRAY, "shape": [1 << 40], "chunks": [1 << 40]}
+    elif kind == "array without chunks":
+        metadata["x/.zarray"], members = {**ARRAY, "shape": [1 << 33], "chunks": [1]}, {}
+    elif kind == "pickled array":
+        metadata["x/.zarray"] = {**ARRAY, "dtype": "|O", "filters": [{"id": "pickle", "protocol": 5}]}
+    elif kind == "another codec":
+        metadata["x/.zarray"] = {**ARRAY, "compressor": {"id": "zlib", "level": 9}}
+    elif kind == "chunk that says it is larger":
+        metadata["x/.zarray"] = {
+            **ARRAY,
+            "compressor": {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 2, "blocksize": 0},
+        }
+        members = {"x/0": struct.pack("<4B3I", 2, 1, 0x21, 4, 1 << 31, 1 << 20, 64).ljust(64, b"\0")}
+    elif kind == "member outside":
+        return _itar(members, metadata, {"items": ["a"], "offset_datas": [1 << 50], "sizes": [10]})
+    elif kind == "index of another kind":
+        return _itar(members, metadata, {"items": 7, "offset_datas": [1], "sizes": []})
+    elif kind == "a million lists":
+        metadata["x/.zattrs"] = [[] for _ in range(900_000)]
+    elif kind == "deep metadata":
+        deep: Any = 0
+        for _ in range(400):
+            deep = [deep]
+        assert cbor2.dumps(deep)
+        metadata["x/.zarray"] = deep
+    return _itar(members, metadata)
+
+
+SAID = {
+    "index bomb": "unpack to more", "metadata bomb": "unpack to more", "huge array": "larger than its file",
+    "array without chunks": "larger than its file", "pickled array": "packed in a way", "another codec": "packed in a way",
+    "chunk that says it is larger": "larger than its file|another size|damaged", "member outside": "outside of the file",
+    "index of another kind": "index", "deep metadata": "are damaged", "nothing in it": "cannot be read|no poses",
+    "a million lists": "cannot be read|no poses",
+}  # fmt: skip
+
+
+@needs_package
+@pytest.mark.parametrize("kind", SAID)
+def test_hostile_stores_are_refused_before_they_cost_memory(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "a.ncore4.zarr.itar").write_bytes(_hostile(kind))
+    with at_most(150):
+        error = roundtrip.assert_refused(ingest, tmp_path, tmp_path / "out", SAID[kind])
+    assert "a.ncore4" in error.where or kind in ("nothing in it", "a million lists")
+
+
+@needs_package
+def test_metadata_that_would_fill_the_memory_are_refused_before_they_are_taken_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mudg.base.memory.free_bytes", lambda: 50 << 20)
+    with pytest.raises(ResourceError, match=r"needs more memory(?s:.*)68.7 MiB"):
+        container._cbor(b"\x9a\x00\x0d\xbb\xa0" + b"\x80" * 900_000, "a store")
+
+
+def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """A recording whose metadata say something else."""
+    import cbor2  # type: ignore[import-not-found]
+
+    (path,) = recording.glob("*.itar")
+    found = container._members_of_tar(path)
+    members = {name: member.read() for name, member in found.items() if name != container.METADATA}
+    metadata = cbor2.loads(lzma.decompress(found[container.METADATA].read()))["metadata"]
+    change(metadata)
+    (folder / path.name).write_bytes(_itar(members, metadata))
+    return folder
+
+
+FRONT = "intrinsics/default/cameras/front/.zattrs"
+RIG_POSES, BOXES = "poses/default/dynamic_poses/.zattrs", "cuboids/default/cuboids/.zattrs"
+
+
+def each_pose(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, Any]], object]:
+    def spoil(metadata: dict[str, Any]) -> None:
+        path = metadata[RIG_POSES]["('rig', 'world')"]
+        path["poses"] = [change(np.array(pose)).tolist() for pose in path["poses"]]
+
+    return spoil
+
+
+def each_box(change: Callable[[dict[str, Any]], object]) -> Callable[[dict[str, Any]], object]:
+    return lambda metadata: [change(one) for one in metadata[BOXES]["cuboid_track_observations"]]
+
+
+def slower(metadata: dict[str, Any]) -> None:
+    """Times in nanoseconds."""
+    frames = metadata["cameras/front/frames/.zattrs"]["frames_timestamps_us"]
+    for span in frames:
+        span[:] = [1000 * at for at in span]
+
+
+BAD = {
+    "poses scaled": (each_pose(lambda pose: pose @ np.diag([2, 2, 2, 1])), "pose is scaled"),
+    "poses left-handed": (each_pose(lambda pose: pose @ np.diag([1, -1, 1, 1])), "left-handed"),
+    "poses not finite": (each_pose(lambda pose: pose * [[1, 1, 1, np.nan]]), "not finite"),
+    "sides swapped": (each_box(lambda box: box["bbox3"].update(dim=[1.8, 4.5, 1.5])), "swapped"),
+    "box of no size": (each_box(lambda box: box["bbox3"].update(dim=[4.5, 0.0, 1.5])), "size makes no sense"),
+    "box not finite": (each_box(lambda box: box["bbox3"].update(centroid=[0.0, np.nan, 0.0])), "box is not finite"),
+    "frame of a box unknown": (each_box(lambda box: box.update(reference_frame_id="radar")), "radar"),
+    "times in another unit": (slower, "another unit"),
+    "no intrinsics": (lambda metadata: metadata.pop(FRONT), "cannot be read"),
+    "a lens of another kind": (lambda m: m[FRONT].update(camera_model_type="x"), "Unknown camera model"),
+    "no camera": (lambda m: [m.pop(name) for name in list(m) if name.startswith("cameras/")], "no camera"),
+}  # fmt: skip
+
+
+@needs_package
+@pytest.mark.parametrize("case", BAD)
+def test_recordings_that_contradict_themselves_are_refused(case: str, recording: Path, tmp_path: Path) -> None:
+    change, said = BAD[case]
+    (tmp_path / "log").mkdir()
+    roundtrip.assert_refused(ingest, altered(recording, tmp_path / "log", change), tmp_path / "out", said)
+
+
+@needs_package
+def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Path) -> None:
+    """Cut at some lengths and flipped in metadata and data: an error in words, or (pixels and points have no checksum) a scene."""
+    (store,) = recording.glob("*.itar")
+    content, rng = store.read_bytes(), np.random.default_rng(3)
+    target = tmp_path / "log" / store.name
+    target.parent.mkdir()
+    for length in [0, 1, 511, 512, len(content) - 512, len(content) - 1, *rng.integers(513, len(content), 8).tolist()]:
+        target.write_bytes(content[:length])
+        roundtrip.assert_refused(ingest, target.parent, tmp_path / "cut", ".")
+    places = [
+        *rng.integers(0, len(content), 12).tolist(),
+        *rng.integers(len(content) - 6000, len(content) - 400, 12).tolist(),
+    ]
+    for number, at in enumerate(places):
+        flipped = bytearray(content)
+        flipped[at] ^= 1 << int(rng.integers(8))
+        target.write_bytes(bytes(flipped))
+        with contextlib.suppress(InputError), at_most(600):
+            ingest(target.parent, tmp_path / f"flipped{number}")
+            continue
+        assert not (tmp_path / f"flipped{number}").exists()
