@@ -379,8 +379,9 @@ trap pass_on USR1 TERM
 mudg batch run --list 'a b.txt' &
 child=$!
 wait "$child"
+while kill -0 "$child" 2>/dev/null; do wait "$child"; done
+wait "$child"  # one that a signal cut short does not say how the task ended
 code=$?
-while kill -0 "$child" 2>/dev/null; do wait "$child"; code=$?; done
 if [ "$code" -eq 143 ]; then
   scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}" && sleep 60
 fi

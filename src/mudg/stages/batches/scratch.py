@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import yaml
 
-from mudg.base import log, store
+from mudg.base import log, store, transfer
 from mudg.base.errors import InputError, IntegrityError, MudgError, ResourceError
 from mudg.base.location import Location
 from mudg.stages.batches.folders import BatchFolder
@@ -58,7 +58,9 @@ class WorkFolder:
     def adopted(self) -> Path | None:
         """The published result, if a worker that was cut off left one without a commit record."""
         place = self._published.local
-        if not self.in_output or place is None or not place.exists():
+        if not self.in_output or place is None:
+            return self._fetched() if self._attempt > 1 else None
+        if not place.exists():
             return None
         if (place / store.MANIFEST).is_file():
             try:
@@ -69,6 +71,19 @@ class WorkFolder:
                 place.rename(self._root / f"{self._unit.key}.damaged")
                 return None
         return place
+
+    def _fetched(self) -> Path | None:
+        """The same where results are uploaded."""
+        try:
+            upload = transfer.uploaded(self._published.side)
+            if upload is None or not upload.complete:
+                return None
+            self._published.fetch(self.result)
+        except MudgError as error:
+            log.warn(f"{self._published} cannot be used and is made again: {error.what}")
+            shutil.rmtree(self.path, ignore_errors=True)
+            return None
+        return self.result
 
     def prepare(self) -> None:
         """Make the folder, with what earlier attempts left, and stage in what the command reads."""
@@ -105,7 +120,7 @@ class WorkFolder:
             return
         local = source.local
         if local is None:
-            source.fetch(to)
+            _fetch_result(source, to)
             return
         store.make_folder(to.parent)
         with contextlib.suppress(FileExistsError):
@@ -220,6 +235,14 @@ class DirectFolder(WorkFolder):
 def work_folder(folder: BatchFolder, unit: Unit, attempt: int, scratch: Path | None) -> WorkFolder:
     """The folder of an attempt."""
     return DirectFolder(folder, unit, attempt) if unit.stage.direct else WorkFolder(folder, unit, attempt, scratch)
+
+
+def _fetch_result(source: Location, to: Path) -> None:
+    """Stage in a result that is on record. It is whole, but where a second worker is uploading the same once more: a matter of time."""
+    try:
+        source.fetch(to)
+    except InputError as error:
+        raise ResourceError("the result of an earlier step cannot be fetched", where=str(source), got=error.what) from error
 
 
 def default_scratch() -> Path:

@@ -246,7 +246,7 @@ class Worker:
 
     def _still_mine(self, claim: claims.Claim) -> bool:
         try:
-            return not (claim.folder / f"{claim.key}.{claim.attempt + 1}.json").exists()
+            return claim.is_kept()
         except MudgError:
             return True
 
@@ -267,7 +267,7 @@ class Worker:
                 if different is not None:
                     return different, None
             record = self._record(unit, result, ending, wrong)
-            if adopted is None:
+            if adopted is None and (work.in_output or self._claim is None or self._still_mine(self._claim)):
                 self._publish(work)
             return ending, record
         except (MudgError, OSError, MemoryError) as error:
