@@ -23,7 +23,7 @@ from mudg.stages.batches import claims, costs, engines, quality, retries, slurm,
 from mudg.stages.batches.children import Ending, last_words
 from mudg.stages.batches.folders import BatchFolder
 from mudg.stages.batches.lists import Entry, read_list, shard_of
-from mudg.stages.batches.plan import plan_of
+from mudg.stages.batches.plan import BatchPlan, BatchStage, plan_of
 from mudg.stages.batches.scratch import WorkFolder
 from mudg.stages.config import BatchConfig, RunConfig
 
@@ -334,10 +334,25 @@ def test_status_escapes_what_others_wrote(tmp_path: Path) -> None:
 
 
 def test_facts_are_summed_over_the_logs(tmp_path: Path) -> None:
-    scene = {"frames": [1, 2], "cameras": {"front": {}}, "ego": {"times_s": [0.0, 1.5]}, "source": {"dataset": "kitti"}}
+    poses = [[1, 0, 0, x, 0, 1, 0, y, 0, 0, 1, 0] for x, y in ((0, 0), (3, 4), (3, 10))]
+    ego = {"times_s": [0.0, 1.0, 1.5], "world_from_ego": poses}
+    scene = {"frames": [1, 2], "cameras": {"front": {}}, "ego": ego, "source": {"dataset": "kitti"}}
     (tmp_path / "scene.json").write_text(json.dumps(scene))
     (tmp_path / "tracks.json").write_text(json.dumps({"tracks": [{"label": "car"}, {"label": "car"}]}))
-    assert quality.facts_of(tmp_path) == {"dataset": "kitti", "cameras": 1, "images": 2, "seconds": 1.5, "objects": {"car": 2}}
+    facts = {"dataset": "kitti", "cameras": 1, "images": 2, "seconds": 1.5, "metres": 11.0, "objects": {"car": 2}}
+    assert quality.facts_of(tmp_path) == facts
+    folder, plan = BatchFolder(Location.of(tmp_path / "out")), BatchPlan((BatchStage("ingest", COMMAND),))
+    folder.begin(plan, entries(3))
+
+    def copies(unit, folder):
+        shutil.copytree(tmp_path, folder.result, ignore=shutil.ignore_patterns("out"))
+        return Ending(0)
+
+    work.Worker(work.WorkRequest(folder, plan, entries(3)), perform=copies).run()
+    found = status.read_status(folder)
+    corpus = found.record()["corpus"]
+    assert (corpus["scenes"], corpus["images"], corpus["kilometres"], corpus["objects"]) == (3, 6, 0.033, {"car": 6})
+    assert "Kilometres driven" in status.page_of(found)
 
 
 # ---- engines ------------------------------------------------------------------------------------------------------------

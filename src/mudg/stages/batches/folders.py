@@ -9,6 +9,7 @@
               events/<worker>*.jsonl    what happened, by worker
               logs/<key>.txt            the end of what a failed step said
               work/ partial/            unfinished results
+    OUT/_review/                        results for people to look at (review.py)
 """
 
 from __future__ import annotations

@@ -14,14 +14,14 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import failures, log, store
 from mudg.base.errors import MudgError, ResourceError, UsageError
 from mudg.base.usage import folder_bytes
-from mudg.stages.batches import claims, quality, retries
+from mudg.stages.batches import claims, quality, retries, review, turns
 from mudg.stages.batches.children import ChildProcess, Ending
 from mudg.stages.batches.folders import BatchFolder, EventLog
 from mudg.stages.batches.lists import Entry, shard_of
@@ -240,7 +240,7 @@ class Worker:
                 return BUSY
             if record is not None:
                 return self._commit(unit, claim, work, {**record, "began": round(began, 3), "ended": round(time.time(), 3)})
-        if self._stopping and ending.code in (ASKED_TO_STOP, 137, 130, 1):
+        if self._stopping and ending.code in (ASKED_TO_STOP, retries.KILLED, 130, 1):
             ending = Ending(ASKED_TO_STOP, "asked to stop", ending.said, ending.seconds, ending.processor_s)
         return self._after_failure(unit, claim, work, ending)
 
@@ -267,6 +267,8 @@ class Worker:
                 if different is not None:
                     return different, None
             record = self._record(unit, result, ending, wrong)
+            if wrong:
+                review.put(self._folder, record, result)
             if adopted is None and (work.in_output or self._claim is None or self._still_mine(self._claim)):
                 self._publish(work)
             return ending, record
@@ -377,8 +379,17 @@ class Worker:
         return self._stopping or (self._claim is not None and self._claim.lost.is_set())
 
     def _run_command(self, unit: Unit, work: WorkFolder) -> Ending:
-        threads = str(self._rules.threads)
-        environment = {"OMP_NUM_THREADS": threads, "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": threads}
+        killed_before = self._claim is not None and retries.KILLED in self._claim.counts
+        if killed_before:
+            log.warn(f"{unit.title}: killed before, most likely for want of memory: now alone on this machine, with one thread and process")
+        with turns.turn(killed_before, self._is_cancelled) as mine:
+            ending = self._started(unit, work, 1 if killed_before else self._rules.threads) if mine else Ending(ASKED_TO_STOP)
+        if killed_before and ending.code == retries.KILLED:
+            return replace(ending, words="its process was killed by signal 9, also alone on its machine with one thread: out of memory?")
+        return ending
+
+    def _started(self, unit: Unit, work: WorkFolder, threads: int) -> Ending:
+        environment = {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads), turns.HELD: "1"}
         ending = self._child.run(work.command(), work.cwd, environment, self._is_cancelled)
         if ending.code == UsageError.exit_code and (again := work.replacing()) is not None:
             ending = self._child.run(again, work.cwd, environment, self._is_cancelled)
