@@ -48,7 +48,7 @@ def turn(alone: bool, cancelled: Callable[[], bool], folder: Path | None = None)
     folder = folder or default_folder()
     for name in ("door", "room"):
         store.create_once(folder / name, b"")
-    with (folder / "door").open("rb") as door, (folder / "room").open("rb") as room:
+    with store.open_file(folder / "door") as door, store.open_file(folder / "room") as room:
         inside = _locked(door, fcntl.LOCK_EX, cancelled) and _locked(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH, cancelled)
         fcntl.flock(door, fcntl.LOCK_UN)
         yield inside
