@@ -23,7 +23,7 @@ from mudg.stages.batches import claims, costs, engines, quality, retries, slurm,
 from mudg.stages.batches.children import Ending, last_words
 from mudg.stages.batches.folders import BatchFolder
 from mudg.stages.batches.lists import Entry, read_list, shard_of
-from mudg.stages.batches.plan import BatchPlan, BatchStage, plan_of
+from mudg.stages.batches.plan import BatchPlan, BatchStage, command_of, plan_of
 from mudg.stages.batches.scratch import WorkFolder
 from mudg.stages.config import BatchConfig, RunConfig
 
@@ -89,6 +89,19 @@ def test_steps_need_what_they_read() -> None:
             plan_of(names, values)
     with pytest.raises(UsageError, match="where to write"):
         plan_of((), {}, ("program",))
+
+
+def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
+    values = {"ingest": {}, "fuse": {}}
+    entry = Entry("a", "city", {"frames": "0:5", "cameras": "front,left", "seed": "7", "revision": "2"})
+    ingest, fuse = plan_of(("ingest", "fuse"), values).units(entry)
+    (chain,) = plan_of(("run",), values).units(entry)
+    flags = {unit.stage.name: command_of(unit, {"source": "city", "ingest": "i"}, "o", "") for unit in (ingest, fuse, chain)}
+    assert flags["ingest"][-5:] == ["--frames=0:5", "--cameras", "front", "left", "--city.seed=7"]
+    assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
+    assert flags["fuse"][-1] == "--quiet"
+    for words in flags.values():
+        cli.parse(words[3:])
 
 
 def test_a_scene_stays_in_its_shard_when_the_list_grows(tmp_path: Path) -> None:
@@ -643,11 +656,11 @@ def test_an_upload_that_fails_for_a_moment_costs_no_second_run(
     monkeypatch.setattr(work, "_PUBLISH_WAITS_S", (0.0, 0.0))
     tries, runs, publish = [], [], WorkFolder.publish
 
-    def fails_twice(self: WorkFolder) -> None:
+    def fails_twice(self: WorkFolder, read_later: bool = False) -> None:
         tries.append(1)
         if len(tries) <= 2:
             raise ResourceError("no connection")
-        publish(self)
+        publish(self, read_later)
 
     def counted(unit, folder):
         runs.append(1)

@@ -44,4 +44,4 @@ for _ in range(120):
         time.sleep(0.5)
 PYTHON
 cd "$root"
-MUDG_TEST_S3=$servers PYTHONPATH=$root/src${PYTHONPATH:+:$PYTHONPATH} "$folder/venv/bin/python" -m pytest -q -m cluster tests/test_storage_servers.py "$@"
+MUDG_TEST_S3=$servers PYTHONPATH=$root/src${PYTHONPATH:+:$PYTHONPATH} "$folder/venv/bin/python" -m pytest -q -m cluster --durations=10 tests/test_storage_servers.py "$@"

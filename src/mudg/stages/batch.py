@@ -135,7 +135,7 @@ def rules_of(batch: BatchConfig, scratch: Path | None) -> WorkRules:
     return WorkRules(
         lease_s=batch.lease_s, grace_s=batch.grace_s, patience_s=batch.patience_s, steal=batch.steal,
         bounds=quality.parse_bounds(batch.bounds), second_share=batch.verify_share, most_failures=batch.max_failures,
-        scratch=None if scratch is None else Path(scratch).absolute(),
+        scratch=None if scratch is None else Path(scratch).absolute(), scratch_gb=batch.scratch_gb,
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@
     folders.py    where everything of a batch lies, and what is done there
     claims.py     who does what: claims with a lease
     retries.py    what becomes of a failure, by exit code
+    inputs.py     inputs from a store, on this machine
     children.py   the process of one step of one scene
     turns.py      steps beside each other on a machine, or alone
     work.py       a worker: claim, run, publish, record

@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 from mudg.base import store
 
@@ -49,19 +49,27 @@ def turn(alone: bool, cancelled: Callable[[], bool], folder: Path | None = None)
     for name in ("door", "room"):
         store.create_once(folder / name, b"")
     with store.open_file(folder / "door") as door, store.open_file(folder / "room") as room:
-        inside = _locked(door, fcntl.LOCK_EX, cancelled) and _locked(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH, cancelled)
+        inside = lock(door, True, cancelled) and lock(room, alone, cancelled)
         fcntl.flock(door, fcntl.LOCK_UN)
         yield inside
 
 
-def _locked(file: Any, kind: int, cancelled: Callable[[], bool]) -> bool:
+def lock(file: BinaryIO, alone: bool, cancelled: Callable[[], bool]) -> bool:
+    """Lock an open file, in place of a lock held before, until it is closed; False, without any lock, if it was cancelled meanwhile.
+
+    Args:
+        alone: nobody else may hold a lock on it. cancelled: whether to wait no longer; one that is always true: do not wait.
+    """
     pause_s, longest_s = _POLL_S
-    while not cancelled():
+    while fcntl is not None:
         try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
         except BlockingIOError:
+            if cancelled():
+                fcntl.flock(file, fcntl.LOCK_UN)
+                return False
             time.sleep(pause_s)
             pause_s = min(longest_s, 2 * pause_s)
         else:
             return True
-    return False
+    return True
