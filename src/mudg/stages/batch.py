@@ -193,7 +193,7 @@ def show_review(out: str) -> dict[str, Any]:
     found = review.waiting(folder)
     page = review.write_page(folder, found)
     waiting = [{"scene": one.scene, "step": one.stage, "problems": list(one.problems), "place": one.place} for one in found]
-    return {"waiting": waiting, "page": str(page), "text": f"{review.text_of(found)}\npage: {page}"}
+    return {"waiting": waiting, "page": str(page), "text": f"{review.text_of(found, out)}\npage: {page}"}
 
 
 def judge(out: str, scenes: Sequence[str], accepted: bool) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 
 _BOUND: Final = re.compile(r"(?:(?P<file>[^:<>=]+):)?(?P<path>[^:<>=]+?)(?:@(?P<distance>[\d.]+))?(?P<sign><=|>=)(?P<limit>[-+.\deE]+)")
+FOUND: Final = ": it is "
+"""Between a bound and the number that does not keep it."""
 _SCORES: Final = ("score/metrics.json", "metrics.json")
 _LARGEST: Final = 64 << 20
 
@@ -56,7 +58,7 @@ class Bound:
         value = self.value(folder)
         if value is None or (value >= self.limit if self.lower else value <= self.limit):
             return ""
-        return f"{self.text}: it is {value:g}"
+        return f"{self.text}{FOUND}{value:g}"
 
 
 def parse_bounds(texts: Sequence[str]) -> tuple[Bound, ...]:

@@ -61,17 +61,21 @@ def reviews_of(folder: BatchFolder) -> Location:
     return folder.out / REVIEW
 
 
-def put(folder: BatchFolder, record: Mapping[str, Any], result: Path) -> None:
+def put(folder: BatchFolder, record: Mapping[str, Any], result: Path, inputs: Path) -> None:
     """Put a rejected result up for review. A picture that cannot be read is left out; so is everything if the store fails.
 
     Args:
-        record: as for its commit. result: folder or file of it on this machine.
+        record: as for its commit. result: folder or file of it on this machine. inputs: folder with what it was made of; where the
+            result holds few pictures, one of each is shown.
     """
     at = reviews_of(folder) / f"{record['scene']}.{record['stage']}"
     try:
         at.remove()
         names = []
-        for number, picture in enumerate(pictures_of(result)):
+        pictures = pictures_of(result)
+        for made in sorted(inputs.iterdir()) if inputs.is_dir() else []:
+            pictures += pictures_of(made.resolve())[:1]
+        for number, picture in enumerate(pictures[:PICTURES]):
             content = small_picture(picture)
             if content:
                 names.append(f"{number + 1}.jpg")
@@ -185,10 +189,10 @@ def _decide(folder: BatchFolder, one: Candidate, accepted: bool, events: EventLo
     file.remove()
 
 
-def text_of(found: Sequence[Candidate]) -> str:
+def text_of(found: Sequence[Candidate], out: str) -> str:
     """What waits, for a terminal."""
     lines = [f"{one.scene} {one.stage}: {'; '.join(one.problems)}" for one in found]
-    ways = "mudg batch accept OUT --scenes NAME ..., mudg batch reject OUT --scenes NAME ..., or mudg batch retry OUT --reason quality"
+    ways = f"mudg batch accept {out} --scenes NAME ..., reject likewise, or mudg batch retry {out} --reason quality"
     return "\n".join([*lines, f"{len(found)} results wait for review", *([ways] if found else [])])
 
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.memory import in_words
-from mudg.stages.batches import claims, retries, review
+from mudg.stages.batches import claims, quality, retries, review
 from mudg.stages.batches.folders import BatchFolder
 
 _WINDOW_S: Final = 3600.0
@@ -120,7 +120,7 @@ class BatchStatus:
         groups: Counter[tuple[int, str]] = Counter()
         example: dict[tuple[int, str], StepFailure] = {}
         for failure in sorted(self.failures.values(), key=lambda one: one.scene):
-            group = (failure.code, failure.words.split(";")[0][:80])
+            group = (failure.code, failure.words.split(";")[0].split(quality.FOUND)[0][:80])
             groups[group] += 1
             example.setdefault(group, failure)
         rows = []

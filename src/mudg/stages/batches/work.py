@@ -295,7 +295,7 @@ class Worker:
                     return different, None
             record = self._record(unit, result, ending, wrong)
             if wrong:
-                review.put(self._folder, record, result)
+                review.put(self._folder, record, result, work.path / "inputs")
             if adopted is None and (work.in_output or self._claim is None or self._still_mine(self._claim)):
                 self._publish(work, any(unit.stage.name in stage.needs for stage in self._request.plan.stages))
             return ending, record
