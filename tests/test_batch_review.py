@@ -94,13 +94,22 @@ def test_accepted_results_go_on_and_rejected_ones_stay_so(out: Location, tmp_pat
     assert refused["scene"] == "s1" and refused["reviewed"] is True
 
 
-def test_a_retry_takes_results_off_the_list(tmp_path: Path) -> None:
-    asked = rejected(Location.of(tmp_path / "out"))
-    assert batch.retry(str(tmp_path / "out"), "quality")["forgotten"] == 2
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_retry_holds_results_against_the_bounds_of_the_next_run(out: Location, tmp_path: Path) -> None:
+    scratch = None if out.local is not None else tmp_path
+    asked = rejected(out, scratch)
+    assert batch.retry(str(out), "quality")["forgotten"] == 2
     assert review.waiting(asked.folder) == [] and status.read_status(asked.folder).for_review == 0
-    rules = work.WorkRules(patience_s=0.0, bounds=quality.parse_bounds(["x.json:n>=1"]))
+    rules = work.WorkRules(patience_s=0.0, bounds=quality.parse_bounds(["x.json:n>=1"]), scratch=scratch)
     kinder = work.WorkRequest(asked.folder, PLAN, asked.entries, rules)
-    assert work.Worker(kinder, perform=writes).run() == {"done": 2, "rejected": 1}
+    again: list[str] = []
+
+    def noted(unit, folder: WorkFolder) -> Ending:
+        again.append(f"{unit.entry.name} {unit.stage.name}")
+        return writes(unit, folder)
+
+    assert work.Worker(kinder, perform=noted).run() == {"done": 2, "rejected": 1}
+    assert again == ["s1 score"], "what was made once is not made again"
     assert [one.scene for one in review.waiting(asked.folder)] == ["s0"]
 
 

@@ -66,10 +66,10 @@ class WorkFolder:
         return self._folder.out / self._unit.place
 
     def adopted(self) -> Path | None:
-        """The published result, if a worker that was cut off left one without a commit record."""
+        """The published result, if it is there without a commit record: its worker was cut off, or it was rejected and is tried again."""
         place = self._published.local
         if not self.in_output or place is None:
-            return self._fetched() if self._attempt > 1 else None
+            return self._fetched()
         if not place.exists():
             return None
         if (place / store.MANIFEST).is_file():
