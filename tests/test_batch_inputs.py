@@ -54,7 +54,9 @@ def kept(root: Path) -> set[str]:
     return {path.name for path in (root / FOLDER).glob("*/content/*")}
 
 
-def test_an_input_is_fetched_once_and_again_when_it_is_doubted(bucket: Location, tmp_path: Path, fetched: list[str]) -> None:
+def test_an_input_is_fetched_once_and_again_when_it_is_doubted(
+    bucket: Location, tmp_path: Path, fetched: list[str]
+) -> None:
     source, inputs = put(bucket, "a", text="one"), InputStore(tmp_path, 1e6)
     for _ in range(2):
         with inputs.held(source) as path:
@@ -74,7 +76,9 @@ def test_an_input_is_fetched_once_and_again_when_it_is_doubted(bucket: Location,
         pass
 
 
-def test_what_was_used_least_recently_goes_first_and_nothing_in_use(bucket: Location, tmp_path: Path, fetched: list[str]) -> None:
+def test_what_was_used_least_recently_goes_first_and_nothing_in_use(
+    bucket: Location, tmp_path: Path, fetched: list[str]
+) -> None:
     inputs = InputStore(tmp_path, 2500.0)
     with inputs.held(put(bucket, "a")):
         for name in ("b", "c", "b", "d"):
@@ -88,7 +92,9 @@ def test_what_was_used_least_recently_goes_first_and_nothing_in_use(bucket: Loca
     assert kept(tmp_path) == set() and fetched == ["a", "b", "c", "d"]
 
 
-def test_workers_that_want_the_same_fetch_it_once(bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_want_the_same_fetch_it_once(
+    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source, count, fetch = put(bucket, "weights"), [], transfer.fetch
 
     def slow(side: transfer.Side, to: Path) -> frozenset[str]:
@@ -153,7 +159,9 @@ def test_the_next_log_comes_while_a_step_runs_and_results_stay_for_the_next_step
     assert kept(tmp_path) == set(), "a worker that has nothing to do any more leaves nothing"
 
 
-def test_a_bad_log_is_fetched_again_after_it_was_repaired(bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_log_is_fetched_again_after_it_was_repaired(
+    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = batch(bucket, tmp_path)
     tries: list[str] = []
 
@@ -170,9 +178,15 @@ def test_a_bad_log_is_fetched_again_after_it_was_repaired(bucket: Location, tmp_
     assert tries == ["log 1", "log 1 repaired"]
 
 
-def test_weights_at_an_address_are_fetched_once_for_all_scenes(bucket: Location, tmp_path: Path, fetched: list[str]) -> None:
+def test_weights_at_an_address_are_fetched_once_for_all_scenes(
+    bucket: Location, tmp_path: Path, fetched: list[str]
+) -> None:
     put(bucket, "nets/small", text="weights")
-    asked = batch(bucket, tmp_path, {"weights": "memory://bucket/nets/small", "nested": {"model": "memory:/bucket/nets/small"}, "n": 3})
+    asked = batch(
+        bucket,
+        tmp_path,
+        {"weights": "memory://bucket/nets/small", "nested": {"model": "memory:/bucket/nets/small"}, "n": 3},
+    )
     given: list[dict] = []
 
     def looks(unit, folder) -> Ending:
@@ -183,4 +197,8 @@ def test_weights_at_an_address_are_fetched_once_for_all_scenes(bucket: Location,
 
     assert work.Worker(asked, perform=looks).run() == {"done": 6}
     assert fetched.count("small") == 1 and len(given) == 3 and given[0] == given[2]
-    assert given[0]["nested"]["model"] == given[0]["weights"] and given[0]["weights"].startswith("weights/") and given[0]["n"] == 3
+    assert (
+        given[0]["nested"]["model"] == given[0]["weights"]
+        and given[0]["weights"].startswith("weights/")
+        and given[0]["n"] == 3
+    )

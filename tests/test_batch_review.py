@@ -67,7 +67,11 @@ def test_what_is_outside_the_bounds_is_put_up_with_pictures(out: Location, tmp_p
         assert picture.size == (480, 320) and abs(picture.convert("RGB").getpixel((9, 9))[0] - 40) < 5
     state = status.read_status(asked.folder)
     assert [(words, count) for words, count, _ in state.reasons()] == [("quality: x.json:n>=2", 2)]
-    assert state.for_review == 2 and "2 results wait for review" in status.text_of(state) and state.record()["for_review"] == 2
+    assert (
+        state.for_review == 2
+        and "2 results wait for review" in status.text_of(state)
+        and state.record()["for_review"] == 2
+    )
     shown = batch.show_review(str(out))
     page = (out / "_review/index.html").load().decode()
     assert page.count("data:image/jpeg") == 2 and "x.json:n&gt;=2: it is 1" in page and "<script" not in page
@@ -120,14 +124,22 @@ def test_pictures_of_every_kind_are_chosen_first(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     chosen = [path.relative_to(tmp_path).as_posix() for path in review.pictures_of(tmp_path)]
-    assert chosen == ["scene/contact_sheet.jpg", "fit/preview/000002.png", "fused/top.png", "scene/images/front/000000.png"]
+    assert chosen == [
+        "scene/contact_sheet.jpg",
+        "fit/preview/000002.png",
+        "fused/top.png",
+        "scene/images/front/000000.png",
+    ]
     assert review.pictures_of(tmp_path / "nothing") == []
 
 
 def test_a_result_with_few_pictures_is_shown_with_those_it_was_made_of(tmp_path: Path) -> None:
     rejected(Location.of(tmp_path / "out"))
     made = BatchFolder(Location.of(tmp_path / "out"))
-    (first, _), record = review.waiting(made), {"scene": "x", "stage": "score", "key": "k", "problems": ["p"], "place": "x/score/k"}
+    (first, _), record = (
+        review.waiting(made),
+        {"scene": "x", "stage": "score", "key": "k", "problems": ["p"], "place": "x/score/k"},
+    )
     (tmp_path / "inputs").mkdir()
     (tmp_path / "inputs/command").symlink_to(tmp_path / "out" / first.place)
     (tmp_path / "result").mkdir()
@@ -145,4 +157,6 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert cli.main(["batch", "accept", str(out), "--scenes", "s0", "s1"]) == 0
     assert cli.main(["batch", "reject", str(out), "--scenes", "s0"]) == 3
     assert "nothing waits" in capsys.readouterr().err
-    assert [entry.name for entry in read_list(out)] == ["s0", "s1", "s2", "s3"], "neither records nor reviews are sources"
+    assert [entry.name for entry in read_list(out)] == ["s0", "s1", "s2", "s3"], (
+        "neither records nor reviews are sources"
+    )

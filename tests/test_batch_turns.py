@@ -45,17 +45,24 @@ def killed_above(threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     return work.Worker(work.WorkRequest(folder, plan, entries, work.WorkRules(patience_s=5.0, threads=4))).run()
 
 
-def test_a_killed_step_is_tried_again_with_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_killed_step_is_tried_again_with_less(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert killed_above(1, tmp_path, monkeypatch) == {"done": 1}
     (record,) = (json.loads(path.read_text()) for path in (tmp_path / "out/_batch/done").iterdir())
     assert record["attempt"] == 2 and (tmp_path / "out" / record["place"] / "threads").read_text() == "1"
-    assert "one command: killed before, most likely for want of memory: now alone on this machine" in capfd.readouterr().err
+    assert (
+        "one command: killed before, most likely for want of memory: now alone on this machine"
+        in capfd.readouterr().err
+    )
 
 
 def test_a_step_that_is_killed_again_has_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert killed_above(0, tmp_path, monkeypatch) == {"failed": 1}
     (record,) = (json.loads(path.read_text()) for path in (tmp_path / "out/_batch/failed").iterdir())
-    assert (record["code"], record["attempt"]) == (137, 2) and "also alone on its machine with one thread" in record["words"]
+    assert (record["code"], record["attempt"]) == (137, 2) and "also alone on its machine with one thread" in record[
+        "words"
+    ]
 
 
 def test_one_that_is_alone_waits_for_all_and_lets_nobody_in(tmp_path: Path) -> None:

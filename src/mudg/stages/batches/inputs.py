@@ -93,7 +93,11 @@ class InputStore:
             source.fetch(content)  # says what is missing
         names = transfer.fetch(source.side, content)
         if content.is_dir():  # of another version of a log
-            for path in [one for one in content.rglob("*") if not one.is_dir() and one.relative_to(content).as_posix() not in names]:
+            for path in [
+                one
+                for one in content.rglob("*")
+                if not one.is_dir() and one.relative_to(content).as_posix() not in names
+            ]:
                 store.remove(path)
         self._finish(place)
 
@@ -123,7 +127,9 @@ class InputStore:
         """Begin to fetch what is needed next, one at a time. A failure is told by the step that needs it."""
         if any(one.is_alive() for one in self._ahead) or self._is_current(self._place(source, version), False):
             return
-        self._ahead[:] = [threading.Thread(target=self._fetched_ahead, args=(source, version), name="inputs ahead", daemon=True)]
+        self._ahead[:] = [
+            threading.Thread(target=self._fetched_ahead, args=(source, version), name="inputs ahead", daemon=True)
+        ]
         self._ahead[0].start()
 
     def _fetched_ahead(self, source: Location, version: str) -> None:
@@ -139,7 +145,11 @@ class InputStore:
         for file in self._folder.glob("*.lock"):
             place = file.with_suffix("")
             with contextlib.suppress(OSError, InputError, ValueError):  # others remove at the same time
-                size = float(store.read_text(place / _COMPLETE)) if (place / _COMPLETE).exists() else float(folder_bytes(place))
+                size = (
+                    float(store.read_text(place / _COMPLETE))
+                    if (place / _COMPLETE).exists()
+                    else float(folder_bytes(place))
+                )
                 sizes.append((file.stat().st_mtime, place, size))
         total = sum(size for _, _, size in sizes)
         for _, place, size in sorted(sizes):

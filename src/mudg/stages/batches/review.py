@@ -133,7 +133,9 @@ def waiting(folder: BatchFolder) -> list[Candidate]:
                 tuple(str(one) for one in record["pictures"] if "/" not in str(one)), str(record.get("report", "")),
             ))  # fmt: skip
         except (KeyError, TypeError) as error:
-            raise InputError("a record is malformed", where=str(file), got=f"no {error}", remedy="remove its folder") from error
+            raise InputError(
+                "a record is malformed", where=str(file), got=f"no {error}", remedy="remove its folder"
+            ) from error
     return found
 
 
@@ -160,7 +162,9 @@ def judge(folder: BatchFolder, names: Sequence[str], accepted: bool) -> list[Can
         UsageError: no names. InputError: none of these wait.
     """
     if not names:
-        raise UsageError("name the scenes", where="--scenes", expected="names as mudg batch review shows them; '*' is all of them")
+        raise UsageError(
+            "name the scenes", where="--scenes", expected="names as mudg batch review shows them; '*' is all of them"
+        )
     everyone = waiting(folder)
     chosen = [one for one in everyone if any(fnmatch.fnmatchcase(one.scene, name) for name in names)]
     if not chosen:
@@ -185,7 +189,14 @@ def _decide(folder: BatchFolder, one: Candidate, accepted: bool, events: EventLo
         record.pop(name, None)
     record["accepted"] = True
     folder.done(one.key).save(store.json_text(record, indent=None).encode(), only_if_absent=True)
-    events.add("done", **{name: value for name, value in record.items() if name not in ("schema", "source", "place", "host", "problems")})
+    events.add(
+        "done",
+        **{
+            name: value
+            for name, value in record.items()
+            if name not in ("schema", "source", "place", "host", "problems")
+        },
+    )
     file.remove()
 
 
