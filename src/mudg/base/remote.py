@@ -91,7 +91,7 @@ def _opened(scheme: str, process: int) -> Any:
 
         options: dict[str, Any] = {"use_listings_cache": False, "skip_instance_cache": True}
         if package == "s3fs":
-            quick = {"retries": {"max_attempts": 1}, "connect_timeout": 10, "read_timeout": 60}  # what is repeated is counted here
+            quick = {"retries": {"total_max_attempts": 1}, "connect_timeout": 10, "read_timeout": 60}  # what is repeated is counted here
             options |= {"max_concurrency": 1, "config_kwargs": quick}
         found = fsspec.filesystem(scheme, **({} if scheme == "memory" else options))
     except ImportError as error:
@@ -297,18 +297,11 @@ class RemoteStore:
         token = hashlib.sha256(os.urandom(16)).hexdigest()[:16]
         options: dict[str, Any] = {"Metadata": {"mudg-writer": token}} if self._keeps_notes else {}
         lock = _probing if self.scheme == "memory" else contextlib.nullcontext()  # fsspec's own looks first and writes then
-        tries = 0
-
-        def put() -> None:
-            nonlocal tries
-            tries += 1
-            self.files.pipe_file(path, data, mode="create", **options)
-
         try:
             with lock:
-                repeated(put, "writing", self.where(path))
-        except FileExistsError:  # an answer that was lost on the way was repeated: is it this one that is there?
-            return tries > 1 and self.note(path, "mudg-writer") == token
+                self._ask("writing", path, self.files.pipe_file, path, data, mode="create", **options)
+        except FileExistsError:  # after a lost answer, whoever repeated the request, it is this one that is there
+            return self.note(path, "mudg-writer") == token
         except FileNotFoundError as error:
             raise _no_bucket(self.where(path), error) from error
         return True

@@ -11,7 +11,6 @@ the `learn` verb, and the comparison on blocks of frames that were kept for it. 
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -114,7 +113,7 @@ def _make_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson],
     """Fits and clips of all lessons, several made at a time; returns the number of clips made."""
     jobs = [(config, learnt, lesson, [row for row in plan if row[1].name == lesson.name], work) for lesson in lessons]
     made = 0
-    cores = os.cpu_count() or 1
+    cores = native.default_threads()
     processes = config.processes or (cores if config.device == "cpu" else min(cores, SHARING))
     with log.task("lessons", len(jobs)) as bar:
         for _, clips in run_in_processes(make_lesson, jobs, min(processes, len(jobs))):

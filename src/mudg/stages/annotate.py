@@ -11,7 +11,6 @@ stopped.
 from __future__ import annotations
 
 import dataclasses
-import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg import native
 from mudg.base import log, store
 from mudg.base.config import result_settings
 from mudg.base.processes import one_torch_thread, run_in_processes
@@ -148,7 +148,7 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
 def _usual_processes(config: AnnotateConfig) -> int:
     """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with the shipped one,
     whose evidence is gathered on the CPU meanwhile."""
-    cores = os.cpu_count() or 1
+    cores = native.default_threads()
     if config.device == "cpu" or (config.labeller == "geometry" and not config.depth_network):
         return cores
     return 1 if config.labeller == "network" or config.depth_network else min(cores, _SHARING)

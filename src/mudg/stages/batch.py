@@ -1,4 +1,4 @@
-"""``mudg batch run|status|retry|cost``: steps over long lists of driving logs, on any number of workers.
+"""``mudg batch run|status|cost|retry|review|accept|reject``: steps over long lists of driving logs, on any number of workers.
 
 The machinery is in ``stages/batches/``; what it promises, and how to use it, in docs/batch.md.
 """
@@ -20,7 +20,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.location import Location
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import refuse_overlaps
-from mudg.stages.batches import costs, engines, quality, retries, status
+from mudg.stages.batches import costs, engines, quality, retries, review, status
 from mudg.stages.batches.folders import BatchFolder
 from mudg.stages.batches.listed import FAILED_BASE, FAILED_MOST
 from mudg.stages.batches.lists import CITY, Entry, read_list, shard_of
@@ -135,7 +135,7 @@ def rules_of(batch: BatchConfig, scratch: Path | None) -> WorkRules:
     return WorkRules(
         lease_s=batch.lease_s, grace_s=batch.grace_s, patience_s=batch.patience_s, steal=batch.steal,
         bounds=quality.parse_bounds(batch.bounds), second_share=batch.verify_share, most_failures=batch.max_failures,
-        scratch=None if scratch is None else Path(scratch).absolute(),
+        scratch=None if scratch is None else Path(scratch).absolute(), scratch_gb=batch.scratch_gb,
     )  # fmt: skip
 
 
@@ -173,14 +173,36 @@ def _dry(folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry]) -> dict
 
 def show_status(out: str, html: bool = False) -> dict[str, Any]:
     """How far a batch is. html: also write ``status.html`` in its folder."""
-    found = status.read_status(BatchFolder(Location.of(out)))
+    found_in = BatchFolder(Location.of(out))
+    found = status.read_status(found_in)
     result: dict[str, Any] = {**found.record(), "text": status.text_of(found)}
     if html:
         page = Location.of(out) / "status.html"
         page.save(status.page_of(found).encode())
+        if found.for_review:
+            review.write_page(found_in, review.waiting(found_in))
         result["page"] = str(page)
         result["text"] += f"\npage: {page}"
     return result
+
+
+def show_review(out: str) -> dict[str, Any]:
+    """Results outside the bounds, which wait for somebody to look at them; their pictures are on a page. InputError: no batch is here."""
+    folder = BatchFolder(Location.of(out))
+    folder.plan()
+    found = review.waiting(folder)
+    page = review.write_page(folder, found)
+    waiting = [{"scene": one.scene, "step": one.stage, "problems": list(one.problems), "place": one.place} for one in found]
+    return {"waiting": waiting, "page": str(page), "text": f"{review.text_of(found, out)}\npage: {page}"}
+
+
+def judge(out: str, scenes: Sequence[str], accepted: bool) -> dict[str, Any]:
+    """Accept or reject results that wait for review; see ``review.judge``."""
+    folder = BatchFolder(Location.of(out))
+    folder.plan()
+    chosen = review.judge(folder, scenes, accepted)
+    words = "accepted: the next mudg batch run goes on with them" if accepted else "rejected"
+    return {"scenes": [one.scene for one in chosen], "text": f"{len(chosen)} results {words}"}
 
 
 def show_cost(out: str, price: float, storage_price: float) -> dict[str, Any]:
@@ -227,6 +249,7 @@ def retry(out: str, reason: str = "") -> dict[str, Any]:
     for key, failure in by_key.items():
         if not wanted or failure.code in wanted:
             folder.failed(key).remove()
+            review.forget(folder, failure.scene, failure.stage)
             forgotten.append(key)
     if not forgotten and wanted:
         raise InputError("nothing failed for this reason", where=str(folder.out), got=reason,

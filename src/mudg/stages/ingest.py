@@ -142,7 +142,7 @@ def run_many(
     config: IngestConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
 ) -> dict[str, Any]:
     """``run`` for every log of a list; see ``stages/batches/listed.py``. A line may set format, sequence, frames, cameras (with
-    commas), poses and boxes for itself."""
+    commas), poses, boxes and seed (of a city) for itself."""
     entries = lists.read_list(listed, OF_A_LINE)
     return run_listed(ListedRun("ingest", config, entries, out, jobs, overwrite, shard, listed))
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from mudg import native
 from mudg.base import log, palette, store
 from mudg.base.config import result_settings
 from mudg.base.effects import effect_vector
@@ -115,8 +115,8 @@ def run(
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
     loading.half_of(config)  # said before other processes begin
     started = time.monotonic()
-    usual = os.cpu_count() if config.device == "cpu" else 1
-    processes = config.processes or usual or 1
+    usual = native.default_threads() if config.device == "cpu" else 1
+    processes = config.processes or usual
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
     inputs_of = JobInputs(Path(scene), Path(fused), fitted, script)
     jobs = [(config, inputs_of, directory.path, path, model) for path in paths]

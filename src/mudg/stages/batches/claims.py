@@ -26,6 +26,8 @@ from mudg.stages.batches import retries
 
 WORKING: Final = "working"
 WAITING: Final = "waiting"
+_SETTLED_S: Final = 1.0
+"""Where a store cannot exclude others: after so long the claim of the last one to write it stands."""
 
 
 def this_host() -> str:
@@ -77,9 +79,13 @@ class Claim:
         }  # fmt: skip
         return json.dumps(record).encode()
 
+    def is_kept(self) -> bool:
+        """Whether nobody else has taken over, or even finished, which removes all files of the key."""
+        return self.file(self.attempt).exists() and not self.file(self.attempt + 1).exists()
+
     def renew(self) -> bool:
         """Prolong the lease; False, and ``lost`` set, when somebody else has taken over."""
-        if self.lost.is_set() or self.file(self.attempt + 1).exists():
+        if self.lost.is_set() or not self.is_kept():
             self.lost.set()
             return False
         self.file(self.attempt).save(self.content(WORKING, time.time() + self.lease_s))
@@ -88,7 +94,7 @@ class Claim:
     def give_back(self, code: int, until: float) -> None:
         """End the attempt with a failure that is to be tried again, not before ``until``."""
         self.counts[code] = self.counts.get(code, 0) + 1
-        if not self.file(self.attempt + 1).exists():
+        if self.is_kept():
             self.file(self.attempt).save(self.content(WAITING, until))
 
     def close(self) -> None:
@@ -125,7 +131,7 @@ def take(folder: Location, key: str, owner: Owner, lease_s: float) -> Claim | Bu
 def _created(file: Location, content: bytes, owner: Owner) -> bool:
     """Create a claim; False if somebody else did. It need not survive a crash of the machine, as its owner does not: no flush."""
     if file.local is None:
-        return file.save(content, only_if_absent=True)
+        return file.save(content, only_if_absent=True) and (file.exclusive() or _stands(file, content))
     temporary = file.local.with_name(f".{file.name}.{socket.gethostname()}.{owner.process}.part")
     store.write_in_tree(temporary, content)
     try:
@@ -137,6 +143,15 @@ def _created(file: Location, content: bytes, owner: Owner) -> bool:
     finally:
         temporary.unlink(missing_ok=True)
     return True
+
+
+def _stands(file: Location, content: bytes) -> bool:
+    """Whether a claim, made where others may have made it at the same moment, is still one's own once all of them have written."""
+    time.sleep(_SETTLED_S)
+    try:
+        return file.load() == content
+    except InputError:
+        return False
 
 
 def _longer_here(counts: Mapping[int, int]) -> float:

@@ -9,6 +9,7 @@
               events/<worker>*.jsonl    what happened, by worker
               logs/<key>.txt            the end of what a failed step said
               work/ partial/            unfinished results
+    OUT/_review/                        results for people to look at (review.py)
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from mudg.stages.batches.lists import BOOKKEEPING, Entry
 from mudg.stages.batches.plan import BatchPlan
 
 _FLUSH_S: Final = 30.0
+_BEGAN_FLUSH_S: Final = 5.0
+"""What has begun is seen by others earlier than what has ended, which other records tell."""
 _SEGMENT: Final = 500
 """Events per file where files cannot be appended to."""
 
@@ -151,7 +154,8 @@ class EventLog:
             store.append_line(local / f"{self.worker}.jsonl", line)
             return
         self._lines.append(line)
-        if len(self._lines) >= _SEGMENT or time.monotonic() - self._flushed_s > _FLUSH_S:
+        due_s = _BEGAN_FLUSH_S if event == "began" else _FLUSH_S
+        if len(self._lines) >= _SEGMENT or time.monotonic() - self._flushed_s > due_s:
             self.flush()
 
     def flush(self) -> None:

@@ -17,7 +17,9 @@ from mudg.data.scene.schema import NAME_PATTERN
 CITY: Final = "city"
 BOOKKEEPING: Final = "_batch"
 """Folder of a batch's own records, in its output."""
-_LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|\..*|status(-\d+-of-\d+)?\.json")
+REVIEW: Final = "_review"
+"""Folder of results that people are to look at, in a batch's output."""
+_LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|{REVIEW}|\..*|status(-\d+-of-\d+)?\.json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,7 @@ def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry
         given[key] = value
     source = words[0] if words[0] == CITY else _below(folder, words[0])
     name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
-    if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
+    if not NAME_PATTERN.fullmatch(name) or name in (BOOKKEEPING, REVIEW):
         raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
     return Entry(name, source, given)
 

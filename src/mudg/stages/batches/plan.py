@@ -15,10 +15,10 @@ from mudg.base.errors import UsageError
 from mudg.base.versions import version
 from mudg.stages.batches.lists import Entry
 
-RULES_VERSION: Final = 1
+RULES_VERSION: Final = 2
 """Counts up when keys or commands change their meaning: results of older batches are then made again."""
-OF_A_LINE: Final = ("format", "frames", "cameras", "sequence", "poses", "boxes")
-"""Settings of ingest that a line of the list may give."""
+OF_A_LINE: Final = ("format", "frames", "cameras", "sequence", "poses", "boxes", "seed")
+"""Settings of ingest that a line of the list may give; seed is that of a generated city."""
 REVISION: Final = "revision"
 """Setting of a line that only changes the key: another content at the same address."""
 
@@ -195,17 +195,20 @@ def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> 
     words = [_filled(word, filled) for word in unit.stage.words]
     if unit.stage.is_own:
         return words
-    own = list(line_words(unit.entry.settings)) if unit.stage.name == "ingest" else []
+    groups = {"ingest": "", "run": "ingest."}
+    own = list(line_words(unit.entry.settings, groups[unit.stage.name])) if unit.stage.name in groups else []
     return [sys.executable, "-m", "mudg", *words, "--out", out, "--quiet", *(["--config", config] if config else []), *own]
 
 
-def line_words(settings: Mapping[str, str]) -> Iterator[str]:
-    """Flags for the settings of a line of the list."""
+def line_words(settings: Mapping[str, str], group: str = "") -> Iterator[str]:
+    """Flags for the settings of a line of the list. group: what their names begin with: ``ingest.`` in the chain."""
     for name, value in settings.items():
         if name == "cameras":
-            yield from ("--cameras", *value.split(","))
+            yield from (f"--{group}cameras", *value.split(","))
+        elif name == "seed":
+            yield f"--{group}city.seed={value}"
         elif name in OF_A_LINE:
-            yield f"--{name}={value}"
+            yield f"--{group}{name}={value}"
 
 
 def _filled(word: str, values: Mapping[str, str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import re
 from collections import Counter
@@ -15,6 +16,8 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 
 _BOUND: Final = re.compile(r"(?:(?P<file>[^:<>=]+):)?(?P<path>[^:<>=]+?)(?:@(?P<distance>[\d.]+))?(?P<sign><=|>=)(?P<limit>[-+.\deE]+)")
+FOUND: Final = ": it is "
+"""Between a bound and the number that does not keep it."""
 _SCORES: Final = ("score/metrics.json", "metrics.json")
 _LARGEST: Final = 64 << 20
 
@@ -55,7 +58,7 @@ class Bound:
         value = self.value(folder)
         if value is None or (value >= self.limit if self.lower else value <= self.limit):
             return ""
-        return f"{self.text}: it is {value:g}"
+        return f"{self.text}{FOUND}{value:g}"
 
 
 def parse_bounds(texts: Sequence[str]) -> tuple[Bound, ...]:
@@ -106,7 +109,8 @@ def digest_of(folder: Path) -> str:
 
 
 def facts_of(folder: Path) -> dict[str, Any]:
-    """Facts about the log that a result holds a scene of: cameras, images, seconds, objects by class. Empty where there is none."""
+    """Facts about the log that a result holds a scene of: cameras, images, seconds and metres driven, objects by class. Empty where there
+    is none."""
     for scene in (folder, folder / "scene"):
         index = _json(scene / "scene.json")
         if not isinstance(index, Mapping) or "frames" not in index:
@@ -120,9 +124,19 @@ def facts_of(folder: Path) -> dict[str, Any]:
             "cameras": len(index.get("cameras", {})),
             "images": len(index["frames"]),
             "seconds": round(max(times) - min(times), 3) if times else 0.0,
+            "metres": round(_length(ego.get("world_from_ego", [])), 1),
             "objects": dict(sorted(labels.items())),
         }
     return {}
+
+
+def _length(poses: Any) -> float:
+    """Metres along a path, from its poses as rows of a matrix; 0 where they are none."""
+    try:
+        places = [(float(pose[3]), float(pose[7]), float(pose[11])) for pose in poses]
+    except (IndexError, TypeError, ValueError):
+        return 0.0
+    return sum(math.dist(one, following) for one, following in itertools.pairwise(places))
 
 
 def spent_of(folder: Path) -> dict[str, Any]:

@@ -27,6 +27,8 @@ class RetryRule:
     elsewhere: bool = False
 
 
+KILLED: Final = 137
+"""Code of a step that was killed, as the system does where memory runs out."""
 RULES: Final[Mapping[int, RetryRule]] = {
     1: RetryRule("a mistake in the program"),
     2: RetryRule("usage"),
@@ -35,7 +37,7 @@ RULES: Final[Mapping[int, RetryRule]] = {
     5: RetryRule("memory or disk", tries=4, backoff_s=60, elsewhere=True),
     6: RetryRule("numbers"),  # the same settings give the same numbers
     130: RetryRule("interrupted", tries=20),
-    137: RetryRule("killed, most likely for want of memory", tries=4, backoff_s=60, elsewhere=True),
+    KILLED: RetryRule("killed, most likely for want of memory", tries=2, backoff_s=5),  # the second time with less
     143: RetryRule("asked to stop", tries=20),
 }
 LOST: Final = -1

@@ -16,7 +16,7 @@ from typing import Any, Final
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.memory import in_words
-from mudg.stages.batches import claims, retries
+from mudg.stages.batches import claims, quality, retries, review
 from mudg.stages.batches.folders import BatchFolder
 
 _WINDOW_S: Final = 3600.0
@@ -60,6 +60,7 @@ class CorpusFacts:
     scenes: int = 0
     images: int = 0
     seconds: float = 0.0
+    metres: float = 0.0
     cameras: Counter[int] = field(default_factory=Counter)
     datasets: Counter[str] = field(default_factory=Counter)
     objects: Counter[str] = field(default_factory=Counter)
@@ -80,6 +81,8 @@ class BatchStatus:
     now: float
     events: Counter[str]
     workers: int = 0
+    for_review: int = 0
+    """Results that wait for somebody to look at them."""
 
     @property
     def total(self) -> int:
@@ -117,7 +120,7 @@ class BatchStatus:
         groups: Counter[tuple[int, str]] = Counter()
         example: dict[tuple[int, str], StepFailure] = {}
         for failure in sorted(self.failures.values(), key=lambda one: one.scene):
-            group = (failure.code, failure.words.split(";")[0][:80])
+            group = (failure.code, failure.words.split(";")[0].split(quality.FOUND)[0][:80])
             groups[group] += 1
             example.setdefault(group, failure)
         rows = []
@@ -139,6 +142,7 @@ class BatchStatus:
         }  # fmt: skip
         corpus = {
             "scenes": self.corpus.scenes, "images": self.corpus.images, "hours": round(self.corpus.seconds / 3600, 4),
+            "kilometres": round(self.corpus.metres / 1000, 4),
             "cameras": {str(count): scenes for count, scenes in sorted(self.corpus.cameras.items())},
             "datasets": dict(self.corpus.datasets.most_common()), "objects": dict(self.corpus.objects.most_common()),
         }  # fmt: skip
@@ -146,7 +150,7 @@ class BatchStatus:
             "out": self.out, "scenes": self.scenes, "finished": self.finished_scenes, "left": self.left(), "stages": stages,
             "reasons": [{"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()],
             "steps_per_hour": round(self.rate() * 3600, 2), "forecast_s": self.forecast_s(), "corpus": corpus,
-            "second_runs": self.events["second"], "second_runs_different": self.events["different"],
+            "for_review": self.for_review, "second_runs": self.events["second"], "second_runs_different": self.events["different"],
         }  # fmt: skip
 
 
@@ -175,6 +179,7 @@ def read_status(folder: BatchFolder) -> BatchStatus:
     state.finished_scenes = state.stages[last].done
     state.ends.sort()
     state.workers = len(workers)
+    state.for_review = review.count(folder)
     return state
 
 
@@ -216,6 +221,7 @@ def _add_done(state: BatchStatus, record: Mapping[str, Any]) -> None:
         corpus.scenes += 1
         corpus.images += int(facts.get("images", 0))
         corpus.seconds += float(facts.get("seconds", 0.0))
+        corpus.metres += float(facts.get("metres", 0.0))
         corpus.cameras[int(facts.get("cameras", 0))] += 1
         corpus.datasets[str(facts.get("dataset", ""))] += 1
         corpus.objects.update({str(name): int(count) for name, count in facts.get("objects", {}).items()})
@@ -307,6 +313,8 @@ def text_of(state: BatchStatus) -> str:
     console.print(grid)
     for words, count, example in state.reasons()[:_SHOWN]:
         out.write(f"{count:7d} x {words}  (e.g. {example})\n")
+    if state.for_review:
+        out.write(f"{state.for_review} results wait for review: mudg batch review {state.out}\n")
     out.write(
         f"{state.finished_scenes} of {state.scenes} scenes are finished, {state.left()} steps are left; "
         f"{state.rate() * 3600:.1f} steps an hour, forecast for the rest: {duration_text(state.forecast_s())}"
@@ -338,9 +346,11 @@ def page_of(state: BatchStatus) -> str:
         funnel=[(name, one.done, one.running, one.waiting, one.failed, one.rejected, state.scenes) for name, one in state.stages.items()],
         rows=stage_rows(state),
         slowest=[(name, one.slowest[1], f"{one.slowest[0]:.1f} s") for name, one in state.stages.items() if one.known],
-        reasons=state.reasons(), failures=list(state.failures.values())[:500], failed=len(state.failures),
+        for_review=state.for_review, reasons=state.reasons(), failures=list(state.failures.values())[:500], failed=len(state.failures),
         figures=[
-            ("Logs", str(corpus.scenes)), ("Hours", f"{corpus.seconds / 3600:.2f}"), ("Images", str(corpus.images)),
+            ("Logs", str(corpus.scenes)), ("Hours driven", f"{corpus.seconds / 3600:.2f}"),
+            ("Kilometres driven", f"{corpus.metres / 1000:.2f}"), ("Images", str(corpus.images)),
+            ("Tracked objects", str(corpus.objects.total())),
             ("Second runs", f"{state.events['second']}, {state.events['different']} different"),
         ],
         cameras=[(f"{count}", str(scenes)) for count, scenes in sorted(corpus.cameras.items())],

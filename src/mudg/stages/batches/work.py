@@ -14,19 +14,21 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import failures, log, store
-from mudg.base.errors import MudgError, ResourceError, UsageError
+from mudg.base.errors import InputError, IntegrityError, MudgError, ResourceError, UsageError
+from mudg.base.location import Location
 from mudg.base.usage import folder_bytes
-from mudg.stages.batches import claims, quality, retries
+from mudg.stages.batches import claims, quality, retries, review, turns
 from mudg.stages.batches.children import ChildProcess, Ending
 from mudg.stages.batches.folders import BatchFolder, EventLog
+from mudg.stages.batches.inputs import GB, InputStore
 from mudg.stages.batches.lists import Entry, shard_of
-from mudg.stages.batches.plan import BatchPlan, Unit
-from mudg.stages.batches.scratch import WorkFolder, work_folder
+from mudg.stages.batches.plan import REVISION, BatchPlan, Unit
+from mudg.stages.batches.scratch import WorkFolder, default_scratch, work_folder
 
 DONE, FAILED, REJECTED, BUSY, AGAIN, STOPPED, LOST = "done", "failed", "rejected", "busy", "again", "stopped", "lost"
 ASKED_TO_STOP: Final = 143
@@ -34,6 +36,8 @@ _REFRESH_S: Final = 30.0
 _PUBLISH_WAITS_S: Final = (1.0, 4.0, 16.0)
 _POLL_S: Final = 1.0
 _LONGEST_POLL_S: Final = 16.0
+_LOOKED_AHEAD: Final = 100
+"""Scenes among which the next one is looked for that is not done yet."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,8 @@ class WorkRules:
         patience_s: how long a worker with nothing to do waits for steps that others hold. steal: whether it takes on scenes of other
             shards. bounds: on results. second_share: share of results that are made twice and compared. most_failures: share (with %)
             or number of failed steps at which all workers stop; empty: never. scratch: folder for what is being made, if not in the
-            output. threads: of each step. most_tries: no failure is tried more often than this.
+            output, and for inputs from a store. scratch_gb: gigabytes of such inputs that stay there, beside those in use. threads: of each
+            step. most_tries: no failure is tried more often than this.
     """
 
     lease_s: float = 600.0
@@ -56,6 +61,7 @@ class WorkRules:
     second_share: float = 0.0
     most_failures: str = ""
     scratch: Path | None = None
+    scratch_gb: float = 20.0
     threads: int = 1
     most_tries: int = 1000
 
@@ -96,6 +102,8 @@ class Worker:
         self._stopping = False
         self._too_many = False
         self._claim: claims.Claim | None = None
+        self._inputs = InputStore((request.rules.scratch or default_scratch()).absolute(), request.rules.scratch_gb * GB)
+        self._coming: Sequence[Entry] = ()
         self.counts: dict[str, int] = {}
 
     # the loop ----------------------------------------------------------------------------------------------------------
@@ -105,13 +113,14 @@ class Worker:
         with self._signals():
             try:
                 self._refresh()
-                for entry in self._own():
+                for entry in self._in_order(self._own()):
                     self._scene(entry)
                     if self._over:
                         break
                 self._rest()
             finally:
                 self._events.flush()
+                self._inputs.evict(0.0)
         return self.counts
 
     @property
@@ -163,7 +172,7 @@ class Worker:
             self._refresh()
             left = [one for one in left if self._is_open(one)]
             self._wait_s.clear()
-            for entry in left:
+            for entry in self._in_order(left):
                 if self._over:
                     return
                 if self._scene(entry):
@@ -173,6 +182,22 @@ class Worker:
                 return
             self._sleep(min(poll_s, max(0.05, min(self._wait_s.values()))))
             poll_s = min(2 * poll_s, _LONGEST_POLL_S)
+
+    def _in_order(self, entries: Sequence[Entry]) -> Iterator[Entry]:
+        """Scenes one after another; what comes next is known meanwhile."""
+        for number, entry in enumerate(entries):
+            self._coming = entries[number + 1 : number + 1 + _LOOKED_AHEAD]
+            yield entry
+
+    def _fetch_ahead(self) -> None:
+        """While a step runs, fetch the log of the next scene that is not done yet."""
+        if "{source}" not in " ".join(self._request.plan.stages[0].words):
+            return
+        for entry in self._coming:
+            if self._is_open(entry):
+                if "://" in entry.source:
+                    self._inputs.ahead(Location.of(entry.source), entry.settings.get(REVISION, ""))
+                return
 
     def _sleep(self, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -231,7 +256,8 @@ class Worker:
     def _claimed(self, unit: Unit, claim: claims.Claim) -> str:
         began, self._claim = time.time(), claim
         self._events.add("began", key=unit.key, scene=unit.entry.name, stage=unit.stage.name, attempt=claim.attempt)
-        work = work_folder(self._folder, unit, claim.attempt, self._rules.scratch)
+        work = work_folder(self._folder, unit, claim.attempt, self._rules.scratch, self._inputs)
+        work.cancelled = self._is_cancelled
         with claims.Heartbeat(claim, self._child.stop):
             ending, record = self._made(unit, work)
             if claim.lost.is_set() or not self._still_mine(claim):
@@ -240,13 +266,13 @@ class Worker:
                 return BUSY
             if record is not None:
                 return self._commit(unit, claim, work, {**record, "began": round(began, 3), "ended": round(time.time(), 3)})
-        if self._stopping and ending.code in (ASKED_TO_STOP, 137, 130, 1):
+        if self._stopping and ending.code in (ASKED_TO_STOP, retries.KILLED, ResourceError.exit_code, 130, 1):
             ending = Ending(ASKED_TO_STOP, "asked to stop", ending.said, ending.seconds, ending.processor_s)
         return self._after_failure(unit, claim, work, ending)
 
     def _still_mine(self, claim: claims.Claim) -> bool:
         try:
-            return not (claim.folder / f"{claim.key}.{claim.attempt + 1}.json").exists()
+            return claim.is_kept()
         except MudgError:
             return True
 
@@ -257,6 +283,7 @@ class Worker:
             adopted = work.adopted()
             if adopted is None:
                 work.prepare()
+                self._fetch_ahead()
                 ending = self._perform(unit, work)
                 if ending.code:
                     return ending, None
@@ -267,8 +294,10 @@ class Worker:
                 if different is not None:
                     return different, None
             record = self._record(unit, result, ending, wrong)
-            if adopted is None:
-                self._publish(work)
+            if wrong:
+                review.put(self._folder, record, result, work.path / "inputs")
+            if adopted is None and (work.in_output or self._claim is None or self._still_mine(self._claim)):
+                self._publish(work, any(unit.stage.name in stage.needs for stage in self._request.plan.stages))
             return ending, record
         except (MudgError, OSError, MemoryError) as error:
             told = failures.in_words(error)
@@ -277,11 +306,11 @@ class Worker:
             words = "; ".join(part for part in (told.what, told.where, told.got) if part)
             return Ending(told.exit_code, words, "", ending.seconds, ending.processor_s), None
 
-    def _publish(self, work: WorkFolder) -> None:
+    def _publish(self, work: WorkFolder, read_later: bool) -> None:
         """Publish, and try again a few times: storage that fails for a moment is no reason to make the result again."""
         for wait_s in (*_PUBLISH_WAITS_S, None):
             try:
-                work.publish()
+                work.publish(read_later)
                 return
             except ResourceError as error:
                 if wait_s is None or self._is_cancelled():
@@ -317,6 +346,7 @@ class Worker:
         """Put a result on record; one that fails a bound is on record as rejected."""
         if record["problems"]:
             words = "; ".join(record["problems"])
+            work.remove()
             return self._fail(unit, claim, Ending(retries.REJECTED, words, "", record["seconds"], record["processor_s"]), REJECTED, record)
         record["attempt"] = claim.attempt
         content = store.json_text(record, indent=None).encode()
@@ -350,6 +380,8 @@ class Worker:
     def _after_failure(self, unit: Unit, claim: claims.Claim, work: WorkFolder, ending: Ending) -> str:
         rule = retries.rule_of(ending.code)
         times = claim.counts.get(ending.code, 0) + 1
+        if ending.code in (InputError.exit_code, IntegrityError.exit_code) and "://" in unit.entry.source:
+            self._inputs.doubt(Location.of(unit.entry.source), unit.entry.settings.get(REVISION, ""))
         useless = rule.fresh or rule.tries == 1  # of a log that is going to be repaired, or of settings that nobody wants
         if useless or (rule.elsewhere and not work.in_output):  # a scratch disk that is full must not stay so
             work.remove()
@@ -377,8 +409,17 @@ class Worker:
         return self._stopping or (self._claim is not None and self._claim.lost.is_set())
 
     def _run_command(self, unit: Unit, work: WorkFolder) -> Ending:
-        threads = str(self._rules.threads)
-        environment = {"OMP_NUM_THREADS": threads, "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": threads}
+        killed_before = self._claim is not None and retries.KILLED in self._claim.counts
+        if killed_before:
+            log.warn(f"{unit.title}: killed before, most likely for want of memory: now alone on this machine, with one thread and process")
+        with turns.turn(killed_before, self._is_cancelled) as mine:
+            ending = self._started(unit, work, 1 if killed_before else self._rules.threads) if mine else Ending(ASKED_TO_STOP)
+        if killed_before and ending.code == retries.KILLED:
+            return replace(ending, words="its process was killed by signal 9, also alone on its machine with one thread: out of memory?")
+        return ending
+
+    def _started(self, unit: Unit, work: WorkFolder, threads: int) -> Ending:
+        environment = {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads), turns.HELD: "1"}
         ending = self._child.run(work.command(), work.cwd, environment, self._is_cancelled)
         if ending.code == UsageError.exit_code and (again := work.replacing()) is not None:
             ending = self._child.run(again, work.cwd, environment, self._is_cancelled)

@@ -51,6 +51,10 @@ class BatchConfig:
     """Address of the Ray cluster (empty = as Ray finds it, or one on this machine)."""
     ray_gpus: float = Field(default=0.0, ge=0)
     """GPUs of each Ray task."""
+    scratch_gb: float = Field(default=20.0, ge=0)
+    """Gigabytes of inputs from a store that stay in --scratch for later steps, beside those in use."""
+    scenes: tuple[str, ...] = ()
+    """accept, reject: names of scenes that wait for review; '*' stands for any letters."""
     price: float = Field(default=0.0, ge=0)
     """Price of one core-hour, for mudg batch cost."""
     storage_price: float = Field(default=0.0, ge=0)
