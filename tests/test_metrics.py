@@ -9,7 +9,7 @@ import torch
 
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, ID
-from mudg.core import metrics
+from mudg.core import flicker, metrics
 from mudg.core.losses import ssim_map
 from mudg.core.metrics import METRICS, Pair
 
@@ -132,3 +132,26 @@ def test_metrics_of_one_source_share_one_measurement(monkeypatch):
         metric.add(measured[name])
     table = metrics.results(of)
     assert (table["abs_rel"], table["rmse_m"], table["delta1"]) == pytest.approx((0.2, 2.0, 1.0))
+
+
+def test_large_images_are_measured_in_pieces_with_the_same_result(monkeypatch):
+    rng = torch.Generator().manual_seed(3)
+    made, true = (torch.rand(3, 37, 53, generator=rng) for _ in range(2))
+    depth, true_depth = (torch.rand(1, 37, 53, generator=rng) * 80 for _ in range(2))
+    ids, true_ids = (torch.randint(0, 22, (37, 53), generator=rng) for _ in range(2))
+    mask = torch.rand(1, 37, 53, generator=rng) > 0.2
+    moved = flicker.PixelMotion(torch.rand(1, 37, 53, 2, generator=rng) * 2 - 1, mask[0])
+
+    def numbers() -> list[float]:
+        depths = metrics.depth_errors(depth, true_depth, mask)
+        return [
+            metrics.psnr(made, true), metrics.psnr(made, true, mask), depths.abs_rel, depths.rmse_m, depths.delta1, depths.pixels,
+            flicker.change(made, true, moved), *metrics.confusion(ids, true_ids, mask).flatten().tolist(),
+        ]  # fmt: skip
+
+    whole = numbers()
+    monkeypatch.setattr(metrics, "PIECE_VALUES", 100)
+    monkeypatch.setattr(flicker, "WHOLE_PIXELS", 500)
+    monkeypatch.setattr(flicker, "BAND_PIXELS", 160)
+    assert len(list(metrics.pieces_of(made))) == 59
+    assert numbers() == pytest.approx(whole, rel=1e-12)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from mudg.base.errors import NumericsError
-from mudg.base.processes import error_from_record, error_record, process_alive
+from mudg.base.processes import Interruption, error_from_record, error_record, process_alive
 
 PATIENCE_S = 60.0
 
@@ -66,3 +69,73 @@ def test_workers_of_a_parent_that_is_killed_end(tmp_path: Path) -> None:
         time.sleep(0.1)
     os.kill(worker, 9)
     raise AssertionError("the worker outlived its parent")
+
+
+def work_in_steps(folder: Path) -> None:
+    """Works like a fit: a signal is taken at the end of a step, and a checkpoint is written."""
+    with Interruption() as interruption:
+        (folder / "started").write_text(str(os.getpid()))
+        while not interruption.requested:
+            time.sleep(0.05)
+        time.sleep(0.5)
+        (folder / "checkpoint").touch()
+        interruption.stop_now()
+
+
+def work_with_cleanup(folder: Path) -> None:
+    """Works like any other step, and tidies up when it is stopped."""
+    try:
+        sleep_long(folder)
+    finally:
+        (folder / "tidy").touch()
+
+
+def call(name: str, folder: Path) -> None:
+    """One of the calls above, or one that must not begin."""
+    {"steps": work_in_steps, "cleanup": work_with_cleanup, "never": sleep_long}[name](folder)
+
+
+def stopped_command(tmp_path: Path, number: int, *, group: bool) -> tuple[int, str, list[int]]:
+    """A command with two workers, two calls that run and three that wait, is sent a signal: exit code, what it said, workers."""
+    names = ["steps", "cleanup", "never", "never", "never"]
+    given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
+    script = (
+        "import sys; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\nimport test_processes as t\nfrom mudg import cli\n"
+        "from mudg.base.processes import run_in_processes\nfrom dataclasses import replace\n"
+        "def work(_args):\n"
+        "    folders = sorted(Path(sys.argv[1]).glob('[0-9]*'))\n"
+        "    for _ in run_in_processes(t.call, [(f.name[1:], f) for f in folders], 2):\n        pass\n"
+        "    return {}\n"
+        "if __name__ == '__main__':\n"
+        "    cli.VERBS['doctor'] = replace(cli.VERBS['doctor'], call=work)\n"
+        "    sys.exit(cli.main(['doctor']))\n"
+    )
+    (tmp_path / "parent.py").write_text(script)
+    places = [str(Path(__file__).parent), *(path for path in sys.path if path)]
+    command = [sys.executable, str(tmp_path / "parent.py"), str(tmp_path), *places]
+    with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as parent:
+        try:
+            wait_for(given[0] / "started")
+            wait_for(given[1] / "started")
+            time.sleep(0.2)
+            os.killpg(parent.pid, number) if group else os.kill(parent.pid, number)
+            said = parent.communicate(timeout=PATIENCE_S)[1]
+        finally:
+            if parent.poll() is None:
+                os.killpg(parent.pid, signal.SIGKILL)
+    return parent.returncode, said, [int((folder / "started").read_text()) for folder in given[:2]]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
+@pytest.mark.parametrize(
+    ("number", "group", "code"), [(signal.SIGTERM, False, 143), (signal.SIGINT, False, 130), (signal.SIGINT, True, 130)]
+)
+def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int, group: bool, code: int) -> None:
+    got, said, workers = stopped_command(tmp_path, number, group=group)
+    assert got == code, said
+    assert "Repeat the same command to resume" in said
+    assert "Traceback" not in said
+    assert (tmp_path / "0steps" / "checkpoint").exists()
+    assert (tmp_path / "1cleanup" / "tidy").exists()
+    assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
+    assert not any(process_alive(worker) for worker in workers)

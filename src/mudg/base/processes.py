@@ -44,6 +44,10 @@ _ERRORS: dict[str, type[MudgError]] = {
 _POLL_S = 0.5
 _NOTICED_AFTER = 20
 """Polls without a result in which a worker is dead, until the pool is given up."""
+_PATIENCE_S = 60.0
+"""Time that workers have to end when a command is stopped: a fit ends its step and writes a checkpoint."""
+_SAME_SIGNAL_S = 10.0
+"""A worker takes signals that come together for one: Ctrl-C reaches it from the terminal and again from its parent."""
 GIB = 1 << 30
 
 
@@ -115,11 +119,12 @@ class Interruption:
 
     Args:
         repeated_within_s: a signal that comes again within this time is taken for the same one. Launchers such as torchrun pass on
-            a signal that the terminal has sent already.
+            a signal that the terminal has sent already; so does the parent of a worker process (10 s).
     """
 
     def __init__(self, repeated_within_s: float = 0.0) -> None:
-        self._repeated_within_s = repeated_within_s
+        in_worker = multiprocessing.parent_process() is not None
+        self._repeated_within_s = max(repeated_within_s, _SAME_SIGNAL_S if in_worker else 0.0)
         self._number = 0
         self._since_s = 0.0
         self._before: dict[int, Any] = {}
@@ -179,6 +184,8 @@ def run_in_processes(
 ) -> Iterator[tuple[int, Result]]:
     """Call a module's ``function`` with each of ``arguments`` in processes of one thread each; ``processes`` = 1 is this one.
 
+    Where this process is stopped (Ctrl-C, SIGTERM), or the caller wants no more results, calls that run are stopped, too.
+
     Yields:
         Index of the arguments and the result, as they come.
 
@@ -193,8 +200,11 @@ def run_in_processes(
     with child_environment(1):
         pool = process_pool(processes)
         try:
-            futures = {pool.submit(function, *items): index for index, items in enumerate(arguments)}
+            futures = {pool.submit(_stoppable, function, items): index for index, items in enumerate(arguments)}
             yield from _as_completed(pool, futures)
+        except (KeyboardInterrupt, GeneratorExit):
+            _stop(pool)
+            raise
         except BrokenProcessPool as error:
             _kill(pool)
             pool.shutdown(wait=False, cancel_futures=True)
@@ -213,6 +223,8 @@ def _as_completed(
     while waiting:
         done, waiting = concurrent.futures.wait(waiting, _POLL_S, concurrent.futures.FIRST_COMPLETED)
         for future in done:
+            if isinstance(future.exception(), KeyboardInterrupt):
+                raise BrokenProcessPool("a worker was stopped")
             yield futures[future], future.result()
         dead_for = dead_for + 1 if not done and any(not one.is_alive() for one in _members(pool)) else 0
         if dead_for > _NOTICED_AFTER:
@@ -228,6 +240,50 @@ def _kill(pool: concurrent.futures.ProcessPoolExecutor) -> None:
     for process in _members(pool):
         with contextlib.suppress(OSError, ValueError):
             process.kill()
+
+
+def _stop(pool: concurrent.futures.ProcessPoolExecutor) -> None:
+    """End the calls of a pool: a fit writes its checkpoint. Who has not ended in time, or when this is interrupted, is killed."""
+    members = _members(pool)
+    pool.shutdown(wait=False, cancel_futures=True)
+    waiting, end_s = {process.sentinel for process in members}, time.monotonic() + _PATIENCE_S
+    try:
+        for process in members:
+            with contextlib.suppress(OSError, ValueError):
+                process.terminate()
+        while waiting and time.monotonic() < end_s:
+            waiting -= set(wait(list(waiting), _POLL_S))  # type: ignore[arg-type]
+    finally:
+        for process in members:
+            if process.sentinel in waiting:
+                with contextlib.suppress(OSError, ValueError):
+                    process.kill()
+
+
+_stop_asked = threading.Event()
+"""Set in a worker that was asked to stop: it begins no further call."""
+
+
+def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Result:
+    """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them itself (``Interruption``)."""
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, _stop_call)
+        if _stop_asked.is_set():
+            raise KeyboardInterrupt
+        return function(*items)
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, _note_stop)
+
+
+def _stop_call(_number: int, _frame: types.FrameType | None) -> None:
+    _stop_asked.set()
+    raise KeyboardInterrupt
+
+
+def _note_stop(_number: int, _frame: types.FrameType | None) -> None:
+    _stop_asked.set()
 
 
 def process_pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:

@@ -78,13 +78,16 @@ def pixel_motion(
             frame; their pixels are carried with them and count as static ones do.
     """
     height, width = frame.ids.shape
-    count = height if height * width <= WHOLE_PIXELS else max(1, BAND_PIXELS // width)
-    found = [
-        _motion_of_rows(frame, following, moved, instance, range(first, min(height, first + count))) for first in range(0, height, count)
-    ]
+    found = [_motion_of_rows(frame, following, moved, instance, rows) for rows in _bands(height, width)]
     if len(found) == 1:
         return found[0]
     return PixelMotion(torch.cat([part.there for part in found], 1), torch.cat([part.same for part in found]))
+
+
+def _bands(height: int, width: int) -> list[range]:
+    """Rows of an image in pieces that are worked on one after the other."""
+    count = height if height * width <= WHOLE_PIXELS else max(1, BAND_PIXELS // width)
+    return [range(first, min(height, first + count)) for first in range(0, height, count)]
 
 
 def _motion_of_rows(
@@ -118,7 +121,12 @@ def _motion_of_rows(
 
 def change(frame: Tensor, following: Tensor, where: PixelMotion) -> float:
     """Summed absolute change of colours f32[3,H,W] from a frame to the following one, over the pixels in ``where.same``."""
-    return float((_sample_at(following, where.there, "bilinear") - frame).abs().mean(0)[where.same].double().sum())
+    total = 0.0
+    for band in _bands(*where.same.shape):
+        rows = slice(band.start, band.stop)
+        apart = (_sample_at(following, where.there[:, rows], "bilinear") - frame[:, rows]).abs().mean(0)
+        total += float(apart[where.same[rows]].double().sum())
+    return total
 
 
 def _sample_at(image: Tensor, there: Tensor, mode: str) -> Tensor:

@@ -9,7 +9,7 @@ with ``build=None`` ("not computed"). Nothing is ever reported as zero for want 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
@@ -24,8 +24,15 @@ from mudg.core.losses import ssim_map
 from mudg.core.view_facts import ViewFacts
 
 CLASS_COUNT: Final = len(CLASSES)
+PIECE_VALUES: Final = 3 * 2_500_000
 SMALLEST_SHARE: Final = 1e-3
 """Masks of dynamic objects that cover less of an image than this do not count: a handful of pixels has no PSNR to speak of."""
+
+
+def pieces_of(values: Tensor) -> Iterator[Tensor]:
+    """All values of a tensor, flat, in pieces of as many as an image of 2.5 million pixels has: what is worked out in double precision
+    would fill the memory at large sizes."""
+    return iter(values.reshape(-1).split(PIECE_VALUES))
 
 
 def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -41,10 +48,10 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     if mask is not None and not bool(mask.all()):
         chosen = mask.expand_as(truth)
         prediction, truth = prediction[chosen], truth[chosen]
-    squared = (prediction.clamp(0, 1) - truth).double() ** 2
-    if squared.numel() == 0:
+    if prediction.numel() == 0:
         return math.nan
-    error = float(squared.mean())
+    pieces = zip(pieces_of(prediction), pieces_of(truth), strict=True)
+    error = sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces) / prediction.numel()
     return math.inf if error == 0 else -10.0 * math.log10(error)
 
 
@@ -82,17 +89,20 @@ def depth_errors(prediction_m: Tensor, truth_m: Tensor, mask: Tensor) -> DepthEr
         InputError: a counted prediction is not finite.
     """
     counted = mask & torch.isfinite(truth_m) & (truth_m > 0)
-    predicted, true = prediction_m[counted].double(), truth_m[counted].double()
-    if predicted.numel() == 0:
+    predicted_m, true_m = prediction_m[counted], truth_m[counted]
+    pixels = predicted_m.numel()
+    if pixels == 0:
         return DepthErrors(math.nan, math.nan, math.nan, 0)
-    if not torch.isfinite(predicted).all():
+    if not torch.isfinite(predicted_m).all():
         raise InputError("a predicted depth is not finite where truth exists", expected="finite metres")
-    error = (predicted - true).abs()
-    ratio = torch.maximum(predicted.clamp_min(1e-6) / true, true / predicted.clamp_min(1e-6))
-    return DepthErrors(
-        float((error / true).mean()), float((error**2).mean().sqrt()), float((ratio < 1.25).double().mean()),
-        int(predicted.numel()),
-    )  # fmt: skip
+    relative, squared, within = 0.0, 0.0, 0
+    for made, given in zip(pieces_of(predicted_m), pieces_of(true_m), strict=True):
+        predicted, true = made.double(), given.double()
+        error = (predicted - true).abs()
+        ratio = torch.maximum(predicted.clamp_min(1e-6) / true, true / predicted.clamp_min(1e-6))
+        relative, squared = relative + float((error / true).sum()), squared + float((error**2).sum())
+        within += int((ratio < 1.25).sum())
+    return DepthErrors(relative / pixels, math.sqrt(squared / pixels), within / pixels, pixels)
 
 
 def confusion(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -106,13 +116,14 @@ def confusion(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> 
     Returns:
         i64[19, 20]: the last column counts predictions outside the 19 classes.
     """
-    true, predicted = truth.long(), prediction.long()
-    counted = (true >= 0) & (true < CLASS_COUNT)
-    if mask is not None:
-        counted = counted & mask.reshape(counted.shape)
-    predicted = torch.where((predicted >= 0) & (predicted < CLASS_COUNT), predicted, CLASS_COUNT)
-    index = true[counted] * (CLASS_COUNT + 1) + predicted[counted]
-    counts = torch.bincount(index, minlength=CLASS_COUNT * (CLASS_COUNT + 1))
+    allowed = torch.ones_like(truth, dtype=torch.bool) if mask is None else mask.reshape(truth.shape)
+    counts = torch.zeros(CLASS_COUNT * (CLASS_COUNT + 1), dtype=torch.int64)
+    for given, made, chosen in zip(pieces_of(truth), pieces_of(prediction), pieces_of(allowed), strict=True):
+        true, predicted = given.long(), made.long()
+        counted = chosen & (true >= 0) & (true < CLASS_COUNT)
+        predicted = torch.where((predicted >= 0) & (predicted < CLASS_COUNT), predicted, CLASS_COUNT)
+        index = true[counted] * (CLASS_COUNT + 1) + predicted[counted]
+        counts += torch.bincount(index, minlength=len(counts))
     return counts.reshape(CLASS_COUNT, CLASS_COUNT + 1)
 
 

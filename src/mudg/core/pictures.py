@@ -110,7 +110,10 @@ def _area_weights(old: int, new: int) -> Any:
 
 def to_bytes(rgb: Tensor) -> NDArray[np.uint8]:
     """Colour f32[3, H, W] in [0, 1] as a picture u8[H, W, 3]."""
-    return (rgb.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+    picture = torch.empty(*rgb.shape[1:], len(rgb), dtype=torch.uint8)
+    for number, channel in enumerate(rgb.detach()):  # all channels in float32 at once are large at 4K
+        picture[..., number] = (channel.clamp(0, 1) * 255).round().byte().cpu()
+    return picture.numpy()
 
 
 def depth_colors(depth_m: NDArray[np.floating], near_m: float = 2.0, far_m: float = 100.0) -> NDArray[np.uint8]:

@@ -103,8 +103,8 @@ def _point_color(part: str) -> Callable[[Pair], tuple[float, int] | None]:
         if points is None or pair.rgb is None or not points.colored.any():
             return None
         chosen = _allowed(torch.from_numpy(_chosen(points, part) & points.colored)[None], pair.mask)[0]
-        true = torch.from_numpy(points.color.copy()).permute(2, 0, 1).float() / 255
-        apart = (pair.rgb.clamp(0, 1) - true)[:, chosen].double()
+        true = torch.from_numpy(points.color[chosen.numpy()].T).float() / 255
+        apart = (pair.rgb[:, chosen].clamp(0, 1) - true).double()
         return float(apart.square().sum()), apart.numel()
 
     return of
@@ -218,7 +218,7 @@ def _lane_colors(pair: Pair) -> tuple[float, int] | None:
     lanes = None if pair.facts is None else pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.band.any():
         return None
-    apart = (pair.rgb.clamp(0, 1).numpy() - lanes.reference)[:, lanes.band]
+    apart = pair.rgb[:, torch.from_numpy(lanes.band)].clamp(0, 1).numpy() - lanes.reference[:, lanes.band]
     return float((apart.astype(np.float64) ** 2).sum()), apart.size
 
 
