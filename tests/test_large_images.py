@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from mudg.base.errors import ResourceError
-from mudg.base.types import Camera, Trajectory, View
+from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core import flicker
 from mudg.core.metrics import Pair
 from mudg.models import featnets
 from mudg.models.featnets import CodecFeatures, PerceptualDistance
 from mudg.models.mdm.codec import CodecConfig, PatchCodec
-from mudg.stages import render
+from mudg.stages import render, synthesize
+from mudg.stages.config import SynthesizeConfig
 
 
 def pair_of(height: int, width: int, *, masked: bool) -> Pair:
@@ -85,3 +86,44 @@ def test_motion_found_in_bands_is_that_of_the_whole(monkeypatch: pytest.MonkeyPa
     assert bands.there.shape == whole.there.shape and whole.same.any()
     torch.testing.assert_close(bands.there, whole.there, rtol=1e-6, atol=1e-6)
     assert torch.equal(bands.same, whole.same)
+
+
+def test_trajectories_are_made_one_after_another_where_memory_lasts_for_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    camera = Camera("front", 3840, 2160, 2000.0, 2000.0, 1920.0, 1080.0)
+    paths = [
+        Trajectory(f"front_shift+{n}.0", (View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.0),) * 3, None)
+        for n in (2, 3)
+    ]
+    monkeypatch.setattr(synthesize.native, "default_threads", lambda: 2)
+    said: list[str] = []
+    monkeypatch.setattr(synthesize.log, "info", said.append)
+    for free_gib, expected in ((64, 2), (8, 1), (1, 1), (0, 2)):
+        monkeypatch.setattr(synthesize.memory, "free_bytes", lambda f=free_gib: f << 30)
+        assert synthesize.usual_processes(SynthesizeConfig(device="cpu"), paths) == expected
+    assert len(said) == 2 and "1 of 2 processes: at 3840x2160 each takes about" in said[0] and "8.0 GiB are free" in said[0]
+    monkeypatch.setattr(synthesize.memory, "free_bytes", lambda: 8 << 30)
+    assert synthesize.usual_processes(SynthesizeConfig(device="cpu", full_size=False), paths) == 2
+
+
+def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
+    noise = torch.Generator().manual_seed(3)
+    camera = Camera("front", 44, 36, 40.0, 40.0, 22.0, 18.0)
+    views = tuple(View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.1 * t) for t in range(2))
+    one = lambda *shape: torch.rand(*shape, generator=noise)  # noqa: E731
+    whole = Condition(views, one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44), backdrop=one(2, 3, 36, 44))
+    part = whole.crop(slice(4, 20), slice(8, 40))
+    assert torch.equal(part.color, whole.color[..., 4:20, 8:40]) and torch.equal(part.backdrop, whole.backdrop[..., 4:20, 8:40])
+    assert part.warped is None and {(v.camera.width, v.camera.height) for v in part.views} == {(32, 16)}
+
+
+def test_perceptual_distance_of_large_images_is_that_of_their_halves(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, distance = pair_of(136, 40, masked=False), small_distance()
+    assert pair.rgb is not None and pair.truth_rgb is not None
+    made, truth = (featnets.F.avg_pool2d(x[None], 2)[0] for x in (pair.rgb, pair.truth_rgb))
+    halves = Pair(made, None, None, truth, None, None, None)
+    expected = distance(halves)
+    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 136 * 40 - 1)
+    monkeypatch.setattr(featnets, "LARGEST_PIXELS", 136 * 40 - 1)
+    assert distance(pair) == pytest.approx(expected, rel=2e-6)

@@ -35,6 +35,8 @@ CONTRAST: Final = 0.08
 STRIPE_SHARE: Final = 1 / 8
 """Stripes wider than this share of the image are no markings."""
 SMOOTH_PX: Final = 0.8
+SMOOTH_REACH_PX: Final = 4
+"""Pixels beyond which the blur sees nothing (4 standard deviations, rounded)."""
 FEWEST_PX: Final = 8
 """Connected regions of fewer pixels are specks."""
 
@@ -136,7 +138,8 @@ def _iou(a: Mask, b: Mask) -> float:
 
 def gray_of(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """Luminance f64[H, W] of colours ``[3, H, W]`` in [0, 1]."""
-    return np.tensordot(np.array([0.299, 0.587, 0.114]), np.clip(np.asarray(rgb, np.float64), 0, 1), 1)
+    red, green, blue = (np.clip(channel.astype(np.float64), 0, 1) for channel in np.asarray(rgb))
+    return 0.299 * red + 0.587 * green + 0.114 * blue
 
 
 def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
@@ -149,6 +152,11 @@ def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
     Args:
         rgb: colours ``[3, H, W]`` in [0, 1]. road: pixels where markings are looked for.
     """
+    rows = rows_of(road, SMOOTH_REACH_PX)
+    if rows.stop - rows.start < len(road):  # what lies above and below the road changes nothing on it
+        whole = np.zeros_like(road)
+        whole[rows] = bright_stripes(rgb[:, rows], road[rows])
+        return whole
     share = np.asarray(ndimage.gaussian_filter(road.astype(np.float64), SMOOTH_PX, mode="nearest"))
     gray = np.asarray(ndimage.gaussian_filter(gray_of(rgb) * road, SMOOTH_PX, mode="nearest")) / np.maximum(share, 1e-6)
     size = (1, max(5, round(gray.shape[1] * STRIPE_SHARE) | 1))
@@ -171,10 +179,18 @@ def tolerant_iou(found: Mask, true: Mask, tolerance_px: int = TOLERANCE_PX) -> t
     return hits, hits + (int(found.sum()) - right) + (int(true.sum()) - covered)
 
 
+def rows_of(mask: Mask, margin: int) -> slice:
+    """Rows in which a mask has pixels, and ``margin`` more on both sides where the image has them; none for an empty mask."""
+    rows = np.flatnonzero(mask.any(1))
+    return slice(max(0, int(rows[0]) - margin), min(len(mask), int(rows[-1]) + 1 + margin)) if len(rows) else slice(0, 0)
+
+
 def _grown(mask: Mask, pixels: int) -> Mask:
     if not mask.any():
         return mask
-    return np.asarray(ndimage.distance_transform_edt(~mask)) <= pixels
+    grown, rows = np.zeros_like(mask), rows_of(mask, pixels)
+    grown[rows] = np.asarray(ndimage.distance_transform_edt(~mask[rows])) <= pixels
+    return grown
 
 
 def lane_band(marking: Mask) -> Mask:

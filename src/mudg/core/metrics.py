@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, Protocol
 
 import torch
@@ -291,7 +291,7 @@ class Flicker:
     """
 
     def __init__(self, motion: StaticMotion | None = None) -> None:
-        self.source = _pair_itself
+        self.source = neighbour_of
         self._motion = motion or StaticMotion()
         self._before: Pair | None = None
         self._made = 0.0
@@ -311,8 +311,11 @@ class Flicker:
         return self._made / self._true if self._true > 0 else None
 
 
-def _pair_itself(pair: Pair) -> Pair:
-    return pair
+def neighbour_of(pair: Pair) -> Pair:
+    """What is kept of a view until the next one comes, to follow surfaces from one to the other: made and true colours, true depth and
+    classes, and the instances. The rest would fill the memory at large sizes."""
+    facts = None if pair.facts is None else ViewFacts(instance=pair.facts.instance)
+    return replace(pair, depth=None, semantics=None, truth_depth_valid=None, mask=None, moving=None, facts=facts)
 
 
 def _exact(pair: Pair) -> bool:

@@ -21,7 +21,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Track
 from mudg.core import flicker, lane_scores
 from mudg.core.box_scores import agent_ious
-from mudg.core.metrics import CLASS_COUNT, FrameMean, Metric, Pair, confusion, depth_errors, iou_of
+from mudg.core.metrics import CLASS_COUNT, FrameMean, Metric, Pair, confusion, depth_errors, iou_of, neighbour_of
 from mudg.core.points_seen import PointTruth
 
 POINT_PARTS: Final = ("", "static", "dynamic")
@@ -210,8 +210,9 @@ def _lane_edges(pair: Pair) -> float | None:
     lanes = None if pair.facts is None else pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.band.any():
         return None
-    made = lane_scores.edges_of(lane_scores.gray_of(pair.rgb.numpy()))
-    return lane_scores.edge_correlation(made, lane_scores.edges_of(lane_scores.gray_of(lanes.reference)), lanes.band)
+    rows = lane_scores.rows_of(lanes.band, 1)
+    made, true = (lane_scores.edges_of(lane_scores.gray_of(rgb[:, rows])) for rgb in (pair.rgb.numpy(), lanes.reference))
+    return lane_scores.edge_correlation(made, true, lanes.band[rows])
 
 
 def _lane_colors(pair: Pair) -> tuple[float, int] | None:
@@ -238,7 +239,8 @@ class TemporalFlickering:
         """Add the next frame."""
         before, self._before = self._before, measured
         if before is not None and measured is not None and before.shape == measured.shape:
-            self._sum += (255.0 - float((before - measured).abs().mean())) / 255.0
+            total = sum(int((a.short() - b).abs().sum()) for a, b in zip(before, measured, strict=True))
+            self._sum += (255.0 - total / measured.numel()) / 255.0
             self._pairs += 1
 
     def value(self) -> float | None:
@@ -247,7 +249,7 @@ class TemporalFlickering:
 
 
 def _bytes_of(pair: Pair) -> Tensor | None:
-    return None if pair.rgb is None else (pair.rgb.clamp(0, 1) * 255).round()
+    return None if pair.rgb is None else torch.stack([(c.clamp(0, 1) * 255).round().byte() for c in pair.rgb])
 
 
 class ExactMotion:
@@ -300,7 +302,7 @@ class WarpError:
     """
 
     def __init__(self, motion: ExactMotion) -> None:
-        self.source = _pair_itself
+        self.source = neighbour_of
         self._motion = motion
         self._before: Pair | None = None
         self._sum, self._pixels = 0.0, 0
@@ -318,10 +320,6 @@ class WarpError:
     def value(self) -> float | None:
         """[0, 1], or None without two frames that show the same surface."""
         return self._sum / self._pixels if self._pixels else None
-
-
-def _pair_itself(pair: Pair) -> Pair:
-    return pair
 
 
 # ---- the table -----------------------------------------------------------------------------------------------------------

@@ -231,12 +231,15 @@ def depth_agreement(depth: Tensor, condition: Condition) -> Tensor:
     those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
     be trusted either.
     """
-    seen = condition.valid.float()
-    ratio = (depth.clamp(min=0.1) / condition.depth.clamp(min=0.1)).log().abs()
-    agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
     pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)  # noqa: E731
-    near = pool(seen)
-    return torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
+    found = torch.empty_like(depth)
+    for number, (made, measured, valid) in enumerate(zip(depth, condition.depth, condition.valid, strict=True)):
+        seen = valid.float()  # one frame at a time: they may be large
+        ratio = (made.clamp(min=0.1) / measured.clamp(min=0.1)).log().abs()
+        agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
+        near = pool(seen)
+        found[number] = torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
+    return found
 
 
 def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:

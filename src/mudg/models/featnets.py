@@ -125,6 +125,8 @@ class CodecFeatures(nn.Module):
 WHOLE_PIXELS: Final = 2_500_000
 """Images of up to this many pixels (1920 x 1280 is just below) are compared in one piece."""
 BAND_PIXELS: Final = 600_000
+LARGEST_PIXELS: Final = 2_500_000
+"""Larger images are halved until they have no more, before they are compared in the features of the codec."""
 LpipsTrunk = Literal["alex", "vgg", "squeeze"]
 LpipsInput = Literal["correct", "unscaled"]
 
@@ -321,6 +323,13 @@ def _bands(height: int, width: int, network: CodecFeatures) -> list[_Band]:
     return [_Band(a, b, min(a, reach), min(height - b, reach)) for a, b in itertools.pairwise(cuts)]
 
 
+def reduced(image: Tensor) -> Tensor:
+    """A large image ``[C, H, W]`` brought to at most ``LARGEST_PIXELS`` by halving it, areas averaged."""
+    while image.shape[-2] * image.shape[-1] > LARGEST_PIXELS:
+        image = F.avg_pool2d(image[None], 2, ceil_mode=True, count_include_pad=False)[0]
+    return image
+
+
 class PerceptualDistance:
     """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
 
@@ -340,7 +349,8 @@ class PerceptualDistance:
             return None
         height, width = pair.rgb.shape[-2:]
         if height * width > WHOLE_PIXELS and isinstance(self._features, CodecFeatures):
-            return self._in_bands(self._features, pair.rgb, pair.truth_rgb, pair.mask)
+            mask = None if pair.mask is None else reduced(pair.mask.float())
+            return self._in_bands(self._features, reduced(pair.rgb), reduced(pair.truth_rgb), mask)
         with torch.no_grad():
             if getattr(self._known, "image", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))

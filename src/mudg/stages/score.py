@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -304,10 +305,15 @@ def _measured(
         facts = ViewFacts(instance=None if truth is None else truth.instance)
     else:
         facts = reference.facts.of(view, truth)
-    measured = {m: metrics.measure(pair_of(o, truth, view, facts), wanted[m]) for m, o in seen.items()}
-    if truth is not None:
-        measured[TRUTH] = metrics.measure(pair_of(truth.seen, truth, view, facts), wanted[TRUTH])
-    return MeasuredView(truth, facts, seen, measured)
+    compared = {**seen, **({} if truth is None else {TRUTH: truth.seen})}
+
+    def measure(name: str) -> dict[str, Any]:
+        return metrics.measure(pair_of(compared[name], truth, view, facts), wanted[name])
+
+    if _is_small(trajectory):  # whose views are measured at the same time
+        return MeasuredView(truth, facts, seen, {name: measure(name) for name in compared})
+    with ThreadPoolExecutor(native.threads()) as pool:
+        return MeasuredView(truth, facts, seen, dict(zip(compared, pool.map(measure, compared), strict=True)))
 
 
 def evenly(items: Sequence[int], count: int) -> list[int]:

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mudg import native
-from mudg.base import log, palette, store
+from mudg.base import log, memory, palette, store
 from mudg.base.config import result_settings
 from mudg.base.effects import effect_vector
 from mudg.base.errors import UsageError
@@ -66,6 +66,11 @@ FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
 EDITED_IMAGES_PER_VIEW = 24
 """Recorded images tried per view of an edited drive: what an object hid at one moment others show."""
+PROCESS_BYTES = int(1.2 * memory.GIB)
+PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
+"""What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's frames. Measured:
+2.0 GiB at 1242x375 with windows of eight frames, 4.5 GiB at 3840x2160 with three."""
+WINDOW_FRAMES = 8
 COMPUTE = ("offload", "compiled")
 """Settings that say how is computed, not what: a result may be resumed and reused under others."""
 _OUTPUT = VerbOutput("synthesize", 2, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
@@ -115,8 +120,7 @@ def run(
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
     loading.half_of(config)  # said before other processes begin
     started = time.monotonic()
-    usual = native.default_threads() if config.device == "cpu" else 1
-    processes = config.processes or usual
+    processes = config.processes or usual_processes(config, paths)
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
     inputs_of = JobInputs(Path(scene), Path(fused), fitted, script)
     jobs = [(config, inputs_of, directory.path, path, model) for path in paths]
@@ -125,6 +129,24 @@ def run(
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
     return directory.path
+
+
+def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> int:
+    """Trajectories made at the same time where the configuration names no number: as many as there are cores and as memory lasts for;
+    one where they would share a GPU. Says so where memory decides."""
+    cores = native.default_threads() if config.device == "cpu" else 1
+    wanted, free = min(cores, len(paths)), memory.free_bytes()
+    if wanted == 1 or not free:
+        return max(1, wanted)
+    camera = max((path.views[0].camera for path in paths), key=lambda c: c.width * c.height)
+    pixels = camera.width * camera.height if config.full_size else 0
+    frames = min(WINDOW_FRAMES, max(map(len, paths)))
+    need = PROCESS_BYTES + pixels * (PIXEL_BYTES + frames * FRAME_PIXEL_BYTES)
+    possible = max(1, min(wanted, free // need))
+    if possible < wanted:
+        log.info(f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
+                 f"{memory.in_words(need)}, and {memory.in_words(free)} are free")  # fmt: skip
+    return possible
 
 
 def _edited(config: SynthesizeConfig, script: EditScript, given: tuple[Scene, Path, Path | None]) -> DriveOfEdits:

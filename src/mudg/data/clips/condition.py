@@ -20,7 +20,7 @@ Training clips are made of these in `from_city.py` and `from_log.py`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -329,9 +329,10 @@ def build_conditions(
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
     points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
-    parts, shown = zip(*(_condition_of_view(points, view, recorded, rules, sources) for view in fine_views))
-    color, depth, valid, warped, backdrop, ids, far_ids = (torch.stack(column) for column in zip(*parts))
-    renders = None if render_at is None else _stacked_renders(shown)
+    made = (_condition_of_view(points, view, recorded, rules, sources) for view in fine_views)
+    rows = ((*part, *(() if render_at is None else _planes(shown))) for part, shown in made)
+    color, depth, valid, warped, backdrop, ids, far_ids, *planes = _stacked(rows, len(fine_views))
+    renders = RenderPlanes(*planes) if planes else None
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
                      warped, backdrop, ids, far_ids, renders)  # fmt: skip
     if size == (rules.width, rules.height):
@@ -356,8 +357,18 @@ def build_conditions(
     return condition, fine
 
 
-def _stacked_renders(shown: Sequence[RenderPlanes]) -> RenderPlanes:
-    return RenderPlanes(*(torch.stack([getattr(r, f.name) for r in shown]) for f in fields(RenderPlanes)))
+def _planes(render: RenderPlanes | None) -> tuple[Tensor, ...]:
+    return tuple(getattr(render, f.name) for f in fields(RenderPlanes))
+
+
+def _stacked(rows: Iterable[Sequence[Tensor]], count: int) -> list[Tensor]:
+    """``torch.stack`` of every column of ``count`` rows, of which only one is in memory besides: they may be large images."""
+    stacks: list[Tensor] = []
+    for number, row in enumerate(rows):
+        stacks = stacks or [torch.empty((count, *x.shape), dtype=x.dtype) for x in row]
+        for stack, x in zip(stacks, row, strict=True):
+            stack[number] = x
+    return stacks
 
 
 def _in_order(renders: RenderPlanes | None) -> RenderAt | None:

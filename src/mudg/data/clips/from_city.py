@@ -301,19 +301,8 @@ def cut_patch(full: Clip, scale: int, side_px: int, rng: np.random.Generator) ->
 def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
     """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
     cut = lambda x: x[..., rows, columns].contiguous()  # noqa: E731
-    given = clip.condition
-
-    width, height = columns.stop - columns.start, rows.stop - rows.start
-
-    def part(view: View) -> View:
-        camera = replace(view.camera, width=width, height=height, cx=width / 2, cy=height / 2)
-        return View(camera, view.world_from_cam, view.time_s)
-
-    names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
-    found = {name: cut(tensor) for name in names if (tensor := getattr(given, name)) is not None}
-    renders = None if given.renders is None else given.renders.map(cut)
-    condition = replace(given, views=tuple(part(view) for view in given.views), **found, renders=renders)
     own = {name: cut(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
+    condition = clip.condition.crop(rows, columns)
     return replace(clip, condition=condition, **own, fine=None, point_color=None)
 
 

@@ -12,6 +12,7 @@ kept, so the result equals that of one pass over the whole image.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -155,18 +156,34 @@ def spans(length: int, longest: int = TILE_PX) -> list[tuple[int, int]]:
     return [(first, last) for first, last in zip(borders, borders[1:], strict=False) if first < last]
 
 
-def finish_in_tiles(finisher: Finisher, made: Made, given: ConditionPixels, tile_px: int = TILE_PX) -> Made:
+class PixelSource(Protocol):
+    """The condition of a clip at the size that is wanted, of which one rectangle at a time is asked."""
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """N, H, W."""
+        ...
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        ...
+
+
+def finish_in_tiles(
+    finisher: Finisher, made: Made, given: PixelSource, tile_px: int = TILE_PX, *, detail: bool = False
+) -> Made:
     """Finish one clip at the size of its condition `given` [N,..,H,W], whatever that is.
 
     Args:
         made: the clip as generated, [N,..,h,w].
         tile_px: longest side of a tile's core; memory depends on it, the result does not.
+        detail: colours get the finest structure of what was warped in (`with_detail`).
     """
-    frames, size = len(given.color), (int(given.color.shape[-2]), int(given.color.shape[-1]))
-    small = made.rgb.shape[-2:]
-    scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=given.color.device)
+    frames, *size = given.grid
+    small, device = made.rgb.shape[-2:], made.rgb.device
+    scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
-    whole = Made(*(torch.empty(frames, c, *size, dtype=t, device=given.color.device) for c, t in (
+    whole = Made(*(torch.empty(frames, c, *size, dtype=t, device=device) for c, t in (
         (3, torch.float32), (1, torch.float32), (1, torch.uint8), (1, torch.float32))))  # fmt: skip
     for top, bottom in spans(size[0], tile_px):
         for left, right in spans(size[1], tile_px):
@@ -174,12 +191,15 @@ def finish_in_tiles(finisher: Finisher, made: Made, given: ConditionPixels, tile
                 (max(0, first - margin), min(length, last + margin))
                 for first, last, length in ((top, bottom, size[0]), (left, right, size[1]))
             )
-            part = _padded(given.crop(slice(*rows), slice(*columns)))
+            bare = given.crop(slice(*rows), slice(*columns))
+            part = _padded(bare)
             reach = (rows[0], rows[0] + part.color.shape[-2]), (columns[0], columns[0] + part.color.shape[-1])
-            found = finisher(made.enlarged(size, *reach), part, frames, scale)
+            found = finisher(made.enlarged((size[0], size[1]), *reach), part, frames, scale)
+            rgb = found.rgb[..., : rows[1] - rows[0], : columns[1] - columns[0]]
+            rgb = with_detail(rgb, bare) if detail else rgb
             core = (..., slice(top - rows[0], bottom - rows[0]), slice(left - columns[0], right - columns[0]))
             target = (..., slice(top, bottom), slice(left, right))
-            whole.rgb[target], whole.depth_code[target] = found.rgb[core], found.depth_code[core]
+            whole.rgb[target], whole.depth_code[target] = rgb[core], found.depth_code[core]
             whole.ids[target] = found.shares.argmax(1, keepdim=True).to(torch.uint8)[core]
             whole.log_error[target] = found.log_error[core]
     return whole

@@ -51,7 +51,7 @@ from mudg.models.mdm.codec import (
     semantic_shares,
 )  # fmt: skip
 from mudg.models.mdm.effects import Effects, Tuning
-from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles, with_detail
+from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles
 from mudg.models.mdm.network import (
     ConditionPixels,
     MDMConfig,
@@ -506,12 +506,11 @@ class MDM(nn.Module):
         """
         if self.finisher is None or clip.log_error is None:
             raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
-        given = self._pixels_of(Stacked.of([fine]))
         code = self.codec.linear_depth_code(clip.depth)
         made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
-            made = finish_in_tiles(self.finisher, made, given)
-        decoded = self._decoded(replace(made, rgb=with_detail(made.rgb, given)))
+            made = finish_in_tiles(self.finisher, made, _FinePixels(self, fine), detail=True)
+        decoded = self._decoded(made)
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
         depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
         return replace(
@@ -552,6 +551,23 @@ class MDM(nn.Module):
         latents = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
         freedom = functional.max_pool2d(start.freedom.to(device), self.codec.factor)[None]
         return latents, freedom
+
+
+@dataclass(frozen=True)
+class _FinePixels:
+    """A condition at the camera's resolution; what the finisher reads of it is made tile by tile, for all of it is large."""
+
+    model: MDM
+    fine: Condition
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """Frames, height, width."""
+        return len(self.fine.views), int(self.fine.color.shape[-2]), int(self.fine.color.shape[-1])
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        return self.model._pixels_of(Stacked.of([self.fine.crop(rows, columns)]))
 
 
 def _expected_error(log_error: Tensor) -> Tensor:

@@ -318,6 +318,11 @@ class ConditionPixels:
     certainty: Tensor | None = None
     render_ids: Tensor | None = None
 
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """N, H, W."""
+        return len(self.color), int(self.color.shape[-2]), int(self.color.shape[-1])
+
     def crop(self, rows: slice, columns: slice) -> ConditionPixels:
         """A rectangle of pixels."""
         return self.map(lambda x: x[..., rows, columns])
