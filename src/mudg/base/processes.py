@@ -266,14 +266,15 @@ _stop_asked = threading.Event()
 
 def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Result:
     """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them itself (``Interruption``)."""
+    heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in heard:
             signal.signal(number, _stop_call)
         if _stop_asked.is_set():
             raise KeyboardInterrupt
         return function(*items)
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in heard:
             signal.signal(number, _note_stop)
 
 
