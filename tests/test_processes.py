@@ -100,13 +100,14 @@ def stopped_command(tmp_path: Path, number: int, *, group: bool) -> tuple[int, s
     names = ["steps", "cleanup", "never", "never", "never"]
     given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
     script = (
-        "import sys; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\nimport test_processes as t\nfrom mudg import cli\n"
+        "import signal, sys; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\nimport test_processes as t\nfrom mudg import cli\n"
         "from mudg.base.processes import run_in_processes\nfrom dataclasses import replace\n"
         "def work(_args):\n"
         "    folders = sorted(Path(sys.argv[1]).glob('[0-9]*'))\n"
         "    for _ in run_in_processes(t.call, [(f.name[1:], f) for f in folders], 2):\n        pass\n"
         "    return {}\n"
         "if __name__ == '__main__':\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in what a script starts in the background
         "    cli.VERBS['doctor'] = replace(cli.VERBS['doctor'], call=work)\n"
         "    sys.exit(cli.main(['doctor']))\n"
     )

@@ -246,12 +246,13 @@ def _stop(pool: concurrent.futures.ProcessPoolExecutor) -> None:
     """End the calls of a pool: a fit writes its checkpoint. Who has not ended in time, or when this is interrupted, is killed."""
     members = _members(pool)
     pool.shutdown(wait=False, cancel_futures=True)
-    waiting, end_s = {process.sentinel for process in members}, time.monotonic() + _PATIENCE_S
+    waiting, begun_s = {process.sentinel for process in members}, time.monotonic()
     try:
-        for process in members:
-            with contextlib.suppress(OSError, ValueError):
-                process.terminate()
-        while waiting and time.monotonic() < end_s:
+        while waiting and time.monotonic() < begun_s + _PATIENCE_S:
+            if time.monotonic() < begun_s + _SAME_SIGNAL_S / 2:  # again: a signal that another thread takes wakes no worker
+                for process in (p for p in members if p.sentinel in waiting):
+                    with contextlib.suppress(OSError, ValueError):
+                        process.terminate()
             waiting -= set(wait(list(waiting), _POLL_S))  # type: ignore[arg-type]
     finally:
         for process in members:
@@ -266,20 +267,22 @@ _stop_asked = threading.Event()
 
 def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Result:
     """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them itself (``Interruption``)."""
+    heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     try:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in heard:
             signal.signal(number, _stop_call)
         if _stop_asked.is_set():
             raise KeyboardInterrupt
         return function(*items)
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in heard:
             signal.signal(number, _note_stop)
 
 
 def _stop_call(_number: int, _frame: types.FrameType | None) -> None:
-    _stop_asked.set()
-    raise KeyboardInterrupt
+    if not _stop_asked.is_set():  # once: what tidies up is not stopped again
+        _stop_asked.set()
+        raise KeyboardInterrupt
 
 
 def _note_stop(_number: int, _frame: types.FrameType | None) -> None:

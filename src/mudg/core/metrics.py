@@ -24,15 +24,24 @@ from mudg.core.losses import ssim_map
 from mudg.core.view_facts import ViewFacts
 
 CLASS_COUNT: Final = len(CLASSES)
-PIECE_VALUES: Final = 3 * 2_500_000
+PIECE_VALUES: Final = 2_500_000
 SMALLEST_SHARE: Final = 1e-3
 """Masks of dynamic objects that cover less of an image than this do not count: a handful of pixels has no PSNR to speak of."""
 
 
-def pieces_of(values: Tensor) -> Iterator[Tensor]:
-    """All values of a tensor, flat, in pieces of as many as an image of 2.5 million pixels has: what is worked out in double precision
-    would fill the memory at large sizes."""
-    return iter(values.reshape(-1).split(PIECE_VALUES))
+def pieces_of(values: Tensor, channels: int = 1) -> Iterator[Tensor]:
+    """All values of a tensor, flat: whole for images of up to 2.5 million pixels, else in pieces. What is worked out in double precision
+    would fill the memory at large sizes.
+
+    Args:
+        channels: values per pixel.
+    """
+    if values.numel() <= PIECE_VALUES * channels:
+        yield values.reshape(-1)
+        return
+    count = max(1, PIECE_VALUES // values[0].numel())
+    for part in values.split(count):
+        yield from pieces_of(part[0] if len(part) == 1 else part)
 
 
 def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -50,7 +59,7 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
         prediction, truth = prediction[chosen], truth[chosen]
     if prediction.numel() == 0:
         return math.nan
-    pieces = zip(pieces_of(prediction), pieces_of(truth), strict=True)
+    pieces = zip(pieces_of(prediction, 3), pieces_of(truth, 3), strict=True)
     error = sum(float(((made.clamp(0, 1) - true).double() ** 2).sum()) for made, true in pieces) / prediction.numel()
     return math.inf if error == 0 else -10.0 * math.log10(error)
 
