@@ -492,7 +492,8 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
 def test_rows_say_what_they_leave_out():
     rows = {row.name: row for row in real.rows_of(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))}
     assert list(rows) == [
-        "street_gaussians", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a",
+        "street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s", "mudg_s-no-adapt",
+        "mudg_s-no-renders", "a",
     ]  # fmt: skip
     assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
         "adapted", "renders", "points", "adapted",
