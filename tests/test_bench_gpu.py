@@ -68,6 +68,17 @@ def test_the_rasterisers_agree(script: Callable[..., dict[str, Any]]) -> None:
 
 
 @pytest.mark.slow
+def test_fewer_passes_of_a_stand_in(script: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    picture = tmp_path / "rows.png"
+    words = ("--batch", "2", "--clips", "2", "--rows", "2", "--picture", str(picture))
+    coded, *rows = script("published_standin", *words)["rows"]
+    assert coded["autoencoder PSNR"] > 0 and [row["passes"] for row in rows] == [300, 120] and picture.is_file()
+    assert all(0 < row["perceptual"] < 5 and row["psnr"] > 0 for row in rows)
+    again = script("published_standin", *words)["rows"]  # trained weights are used again
+    assert again == [coded, *rows]
+
+
+@pytest.mark.slow
 def test_training_of_the_small_model(script: Callable[..., dict[str, Any]]) -> None:
     result = script("train_mdm")
     assert set(result["digests"]) == {"shipped", "trained"}

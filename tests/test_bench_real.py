@@ -429,20 +429,22 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     split = out / "city" / "gap-1"
     watched = [split / "fit" / "street_gaussians" / "run.json", out / "city" / "truth" / "lidar" / "run.json"]
     before = [path.stat().st_mtime_ns for path in watched]
-    added = ("street_gaussians", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
+    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
     more = dataclasses.replace(
         config, methods=added, protocols=("gap-1",), model=model, variant=("rough=densify.kind:none,method:gs3d",)
     )  # fmt: skip
     real.run(more, [city], out, virtual_shifts_m=(2.0,))
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
-    names = ["street_gaussians", "mudg_r-no-adapt", "mudg_s", "mudg_s-no-renders", "rough"]
+    names = ["street_gaussians", "street_gaussians-longer", "mudg_r-no-adapt", "mudg_s", "mudg_s-no-renders", "rough"]
     assert [row["name"] for row in document["methods"]] == names
     assert isinstance(document["protocols"]["gap-1"]["against"]["mudg_s"]["psnr"], float)
     start = store.digest(split / "fit" / "street_gaussians")
-    for name in ("mudg_s", "mudg_s-no-renders"):  # both go on with the fit on recorded views, for half as many steps
+    for name in ("mudg_s", "mudg_s-no-renders", "street_gaussians-longer"):  # all go on with the same fit, for half as many steps
         state = store.read_json(split / "fit" / name / "run.json")
         assert state["inputs"]["start"] == start and state["summary"]["steps"] == config.iterations // 2
+    inputs = store.read_json(split / "fit" / "street_gaussians-longer" / "run.json")["inputs"]
+    assert not [name for name in inputs if "virtual" in name or "observations" in name]
     shown = {name: store.read_json(split / "virtual" / name / "run.json")["inputs"].get("fitted") for name in ("points", "renders")}
     assert shown == {"points": None, "renders": start}
 
@@ -490,7 +492,8 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
 def test_rows_say_what_they_leave_out():
     rows = {row.name: row for row in real.rows_of(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))}
     assert list(rows) == [
-        "street_gaussians", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a",
+        "street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s", "mudg_s-no-adapt",
+        "mudg_s-no-renders", "a",
     ]  # fmt: skip
     assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
         "adapted", "renders", "points", "adapted",

@@ -151,6 +151,11 @@ class FitChain:
         begun = self.first() if plain == fits_of(self.usual)[0] else self._made(plain, self.out / "start" / name)
         return self._made(guided, out, virtual, begun)
 
+    def longer(self, name: str) -> Path:
+        """The first fit and as many more iterations as fits under generated views have, without such views; made if need be."""
+        plain, guided = fits_of(self.usual)
+        return self._made(replace(plain, iterations=guided.iterations), self.out / "fit" / name, begun=self.first())
+
     def _repaired(self, name: str, settings: FitConfig) -> Path:
         """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired so far. Every
         fit goes on with the first one."""

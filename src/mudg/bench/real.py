@@ -60,6 +60,8 @@ from mudg.stages.config import (
 )
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, "street_gaussians", "mudg_r", "mudg_s"
+LONGER: Final = f"{BASE}-longer"
+"""The control of ``mudg_s``: as many iterations, no generated view."""
 VIRTUAL_SHIFTS_M: Final = SynthesizeConfig().shifts_m
 _PAGES: Final = ("bench.json", "bench.md", "page.html")
 _PART: Final = VerbOutput("part of a scene", 1, SCENE_FILES)
@@ -81,16 +83,20 @@ class RealMethod:
     Args:
         name: in tables and folders. fit: method of ``mudg fit``; empty for methods without a fit. sees: how it uses the diffusion model,
             as far as model and log allow; empty for methods without one. changes: settings of the fit in place of those of all fits.
+        longer: goes on with the first fit for as many iterations as fits under generated views do, without such views.
     """
 
     name: str
     fit: str = ""
     sees: Sees | Literal[""] = ""
     changes: FitConfig | None = None
+    longer: bool = False
 
     @property
     def title(self) -> str:
         """For tables."""
+        if self.longer:
+            return title_of(self.fit) + ", as many iterations"
         if not self.sees or self.changes is not None:
             return title_of(self.name)
         return title_of(self.name.removesuffix(LESS[self.sees])) + _LESS_TITLES[self.sees]
@@ -100,12 +106,13 @@ METHOD_ROWS: Final[tuple[RealMethod, ...]] = (
     RealMethod(FILL),
     RealMethod("gs3d", "gs3d"),
     RealMethod(BASE, BASE),
+    RealMethod(LONGER, BASE, longer=True),
     *(RealMethod(name, name) for name in PUBLISHED),
     *(RealMethod(DIFFUSION + ending, sees=sees) for sees, ending in LESS.items()),
     *(RealMethod(FULL + ending, FULL, sees) for sees, ending in LESS.items()),
 )
 """All methods; ``mudg_r`` and ``mudg_s`` are the chain of ``mudg run`` for recorded logs, the rows after each leave out parts of it."""
-ABLATION: Final = (BASE, *(row.name for row in METHOD_ROWS if row.sees))
+ABLATION: Final = (BASE, LONGER, *(row.name for row in METHOD_ROWS if row.sees))
 
 
 @dataclass(frozen=True)
@@ -424,6 +431,8 @@ def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> tuple[
 def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None, cameras: tuple[str, ...]) -> Path:
     """The fit of a method, made if need be, with the generated views that it learns from: beside the recorded path, and where views
     of hidden frames are asked for."""
+    if row.longer:
+        return job.fits.longer(row.name)
     settings = row.changes or configuration.load(FitConfig, job.usual, overrides={"method": row.fit})
     virtual: list[Path] = []
     if use is not None:
