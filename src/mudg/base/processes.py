@@ -249,7 +249,7 @@ def _stop(pool: concurrent.futures.ProcessPoolExecutor) -> None:
     waiting, begun_s = {process.sentinel for process in members}, time.monotonic()
     try:
         while waiting and time.monotonic() < begun_s + _PATIENCE_S:
-            if time.monotonic() < begun_s + _SAME_SIGNAL_S / 2:  # again: a signal that another thread takes wakes no worker
+            if time.monotonic() < begun_s + _SAME_SIGNAL_S / 2:  # again: one that another thread takes wakes nobody
                 for process in (p for p in members if p.sentinel in waiting):
                     with contextlib.suppress(OSError, ValueError):
                         process.terminate()
