@@ -319,22 +319,25 @@ def test_weather_is_corrected_by_a_model_that_takes_an_effect_vector(run: Path, 
     edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
     plain = RenderConfig(shifts_m=(0.0,), video=False)
 
-    def rendered(name: str, model: str, strength: float) -> list[Observation]:
-        harmonize = HarmonizeConfig(on=True, model=model, steps=2, weather=strength)
+    def rendered(name: str, model: str, strength: float, any_model: bool = False) -> list[Observation]:
+        harmonize = HarmonizeConfig(on=True, model=model, steps=2, weather=strength, weather_any_model=any_model)
         config = replace(plain, harmonize=harmonize) if model else plain
         return views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse"))
 
     physical, kept = rendered("physical", "", 0.0), rendered("kept", with_effects(run), 0.0)
     assert "--harmonize.weather is 0" in capsys.readouterr().err
     unknown = rendered("unknown", str(run / "model"), 1.0)
-    assert "takes no effect vector" in capsys.readouterr().err
+    assert "--harmonize.weather-any-model" in capsys.readouterr().err
+    untold = rendered("untold", str(run / "model"), 1.0, any_model=True)
+    assert "without knowing" in capsys.readouterr().err
     made = rendered("made", with_effects(run), 1.0)
     assert len(made) == FRAMES
-    for before, one, two, new in zip(physical, kept, unknown, made, strict=True):
+    for before, one, two, three, new in zip(physical, kept, unknown, untold, made, strict=True):
         assert torch.equal(one.rgb, before.rgb)
         assert torch.equal(two.rgb, before.rgb)
-        assert float((new.rgb - before.rgb).abs().mean()) > 0.01
-        assert torch.equal(new.semantics, before.semantics)
+        for corrected_view in (three, new):
+            assert float((corrected_view.rgb - before.rgb).abs().mean()) > 0.01
+            assert torch.equal(corrected_view.semantics, before.semantics)
 
 
 @pytest.mark.slow

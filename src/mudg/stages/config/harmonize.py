@@ -27,7 +27,10 @@ class HarmonizeConfig:
     """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
     weather: float = Field(default=0.0, ge=0, le=1)
     """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it. For models that take
-    an effect vector."""
+    an effect vector, unless ``weather_any_model`` is set."""
+    weather_any_model: bool = False
+    """Let a model that takes no effect vector, as the shipped ones, correct weather and light, too: it repairs the edited render without
+    being told which weather it is to have."""
     changed_above: float = Field(default=4 / 255, ge=0, le=1)
     """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as they are."""
     feather_px: int = Field(default=3, ge=0)

@@ -1,8 +1,9 @@
 """Views in other weather or light that a diffusion model corrects, after the formulas of `core.weather`.
 
 The model is given the condition of the drive in that weather, with its effect vector, and begins from the render in that weather; every
-pixel is free from the noise level on that ``HarmonizeConfig.weather`` says. It works at its own size: what it changes there is enlarged
-and added to the render, which so keeps its detail. Depth, classes and confidence stay as rendered.
+pixel is free from the noise level on that ``HarmonizeConfig.weather`` says. A model that takes no effect vector is not told the weather;
+it repairs the render alone, and only if ``HarmonizeConfig.weather_any_model`` asks for it. Models work at their own size: what they
+change there is enlarged and added to the render, which so keeps its detail. Depth, classes and confidence stay as rendered.
 """
 
 from __future__ import annotations
@@ -38,10 +39,18 @@ def harmonises_weather(config: HarmonizeConfig, how: InWeather) -> bool:
     """Whether a diffusion model corrects this weather; says so where it was asked for and cannot be."""
     if effect_vector(how.settings) is None:
         return False
-    known = not is_published(config.model) and takes_effects(config.model)
-    if config.weather > 0 and known:
+    told = not is_published(config.model) and takes_effects(config.model)
+    able = told or (config.weather_any_model and not is_published(config.model))
+    if config.weather > 0 and able:
+        if not told:
+            log.info(f"{config.model} takes no effect vector: it corrects views without knowing their weather and light")
         return True
-    why = "--harmonize.weather is 0" if known else f"the diffusion model {config.model} takes no effect vector"
+    if able:
+        why = "--harmonize.weather is 0"
+    elif is_published(config.model):
+        why = f"the published-type diffusion model {config.model} takes no effect vector"
+    else:
+        why = f"the diffusion model {config.model} takes no effect vector (--harmonize.weather-any-model lets it correct them all the same)"
     log.info(f"weather and light are those of the formulas alone: {why}")
     return False
 
@@ -64,7 +73,7 @@ class WeatherHarmoniser:
         settings = loading.check_config(settings, fitted=True)
         self._model = loading.load_any(settings)
         self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
-        self._how, self._freedom = how, config.weather
+        self._how, self._freedom, self._told = how, config.weather, takes_effects(config.model)
         width, height = self._model.image_size(*size, 0)
         rules = ConditionRules(width, height, 2 * width, 2 * height, images_per_view=config.images_per_view)
         self._given = ConditionSources(
@@ -83,6 +92,7 @@ class WeatherHarmoniser:
             condition = weathered(
                 conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0], self._how
             )
+            condition = condition if self._told else replace(condition, effect=None)
             shown = list(renders.values())
             freedom = [torch.full_like(render.rgb[0], self._freedom) for render in shown]
             start = start_clip(shown, freedom, condition.color.shape[-2:])
