@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from mudg.base.crop import cropped
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core import flicker
@@ -113,7 +114,7 @@ def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
     views = tuple(View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.1 * t) for t in range(2))
     one = lambda *shape: torch.rand(*shape, generator=noise)  # noqa: E731
     whole = Condition(views, one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44), backdrop=one(2, 3, 36, 44))
-    part = whole.crop(slice(4, 20), slice(8, 40))
+    part = cropped(whole, slice(4, 20), slice(8, 40))
     assert torch.equal(part.color, whole.color[..., 4:20, 8:40]) and torch.equal(part.backdrop, whole.backdrop[..., 4:20, 8:40])
     assert part.warped is None and {(v.camera.width, v.camera.height) for v in part.views} == {(32, 16)}
 

@@ -439,16 +439,6 @@ class Condition:
         if self.renders is not None:
             checks.check_tensors(self.renders, color=(t, 3, h, w))
 
-    def crop(self, rows: slice, columns: slice) -> Condition:
-        """A rectangle of pixels of all views. Its cameras only say how large it is: they look straight ahead."""
-        width, height = columns.stop - columns.start, rows.stop - rows.start
-        lens = {"width": width, "height": height, "cx": width / 2, "cy": height / 2}
-        views = tuple(replace(view, camera=replace(view.camera, **lens)) for view in self.views)
-        names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
-        maps = {name: x[..., rows, columns].contiguous() for name in names if (x := getattr(self, name)) is not None}
-        renders = None if self.renders is None else self.renders.map(lambda x: x[..., rows, columns].contiguous())
-        return replace(self, views=views, renders=renders, **maps)
-
     def to(self, device: torch.device) -> Condition:
         """The same condition with its tensors on a device."""
         renders = None if self.renders is None else self.renders.to(device)

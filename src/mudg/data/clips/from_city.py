@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from mudg import native
-from mudg.base import geometry, seeds
+from mudg.base import crop, geometry, seeds
 from mudg.base.log import progress
 from mudg.base.types import Clip, Condition, FinePatch, Photo, View
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
@@ -302,7 +302,7 @@ def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
     """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
     cut = lambda x: x[..., rows, columns].contiguous()  # noqa: E731
     own = {name: cut(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
-    condition = clip.condition.crop(rows, columns)
+    condition = crop.cropped(clip.condition, rows, columns)
     return replace(clip, condition=condition, **own, fine=None, point_color=None)
 
 

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base import palette, seeds
+from mudg.base.crop import cropped
 from mudg.base.errors import UsageError
 from mudg.base.types import Clip, Condition
 from mudg.core import losses, noise
@@ -567,7 +568,7 @@ class _FinePixels:
 
     def crop(self, rows: slice, columns: slice) -> ConditionPixels:
         """A rectangle of pixels."""
-        return self.model._pixels_of(Stacked.of([self.fine.crop(rows, columns)]))
+        return self.model._pixels_of(Stacked.of([cropped(self.fine, rows, columns)]))
 
 
 def _expected_error(log_error: Tensor) -> Tensor:
