@@ -49,11 +49,13 @@ def test_a_page_has_a_card_and_the_scores_of_every_run(tmp_path: Path) -> None:
     store.write_json(runs / "score" / "metrics.json", scores_of("kitti", 20.0))
     store.write_json(runs / "bench" / "bench.json", {"bench": "real"})
     store.write_text(runs / "bench" / "page.html", "tables")
+    store.write_text(runs / "c" / "viewer_page" / "index.html", "a large viewer page")
     found = gallery.run([runs, runs / "c"], tmp_path / "pages" / "all.html")
     assert found["shown"] == 4  # c once
     page = (tmp_path / "pages" / "all.html").read_text()
     assert 'href="../runs/a%20b/report.html"' in page and 'href="../runs/bench/page.html"' in page
-    assert "viewer.html" not in page  # there is none
+    assert "viewer.html" not in page  # there is none, but a folder
+    assert 'href="../runs/c/viewer_page/index.html"' in page
     assert page.count("data:image/jpeg;base64,") == 2
     assert "1 min 5 s" in page and "12 frames of 1 cameras" in page
     rows = re.findall(r'<tr><th scope="row">(.*?)</th><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>', page)

@@ -208,6 +208,10 @@ def test_a_large_page_becomes_a_folder_whose_files_it_knows(
         assert base64.b64decode(record["sha256"]) == hashlib.sha256(content).digest()
     assert {path.name for path in folder.iterdir()} == {"index.html", *(record["url"] for record in records)}
     assert not (tmp_path / "page.html").exists()
+    (tmp_path / "again").mkdir()
+    view.run_page(PageConfig(images=0), toy[1], tmp_path / "again" / "page.html", scene=toy[0] / "scene", report="report.html")
+    index = (tmp_path / "again" / "page_page" / "index.html").read_text(encoding="utf-8")
+    assert 'href="../report.html"' in index  # which lies beside the folder
 
 
 def test_a_folder_is_made_alike_twice(

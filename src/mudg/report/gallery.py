@@ -16,7 +16,7 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.report import html
-from mudg.report.run_report import VIEWER
+from mudg.report.run_report import viewer_address
 from mudg.report.score_tables import TERMINAL_METRICS, number_text
 
 THUMBNAIL_PX: Final = 320, 120
@@ -80,7 +80,7 @@ def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
     _require_finished(folder, state)
     scores = _scores(folder / "score" / "metrics.json")
     seconds = sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())
-    known = {"report": folder / "report.html", "viewer": folder / VIEWER, "scores": folder / "score" / "metrics.md"}
+    known = {"report": folder / "report.html", "viewer": folder / viewer_address(folder), "scores": folder / "score" / "metrics.md"}
     pages = {title: path for title, path in known.items() if path.is_file()}
     minutes, rest = divmod(round(seconds), 60)
     return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)

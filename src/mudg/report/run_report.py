@@ -27,6 +27,7 @@ PANEL_WIDTH: Final = 320
 BUDGET_BYTES: Final = 9 * 2**19
 """For all videos together, before base64; with the posters the page stays under 8 MB."""
 VIEWER: Final = "viewer.html"
+VIEWER_FOLDER: Final = "viewer_page/index.html"
 SAME_TIME_S: Final = 1e-4
 ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
 ENCODING: Final = Encoding(FPS, first_crf=33, last_crf=45, preset="veryfast")
@@ -71,9 +72,13 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     settings = out / "run.yaml"
     text = store.read_text(settings) if settings.is_file() else ""
     columns = list(_folders(out, scores))
-    viewer = VIEWER if (out / VIEWER).is_file() else ""
-    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt"), viewer))
+    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt"), viewer_address(out)))
     return out / "report.html"
+
+
+def viewer_address(out: Path) -> str:
+    """The viewer page of a run, relative to its folder: one file, or the first page of a folder; empty if there is none."""
+    return next((name for name in (VIEWER, VIEWER_FOLDER) if (out / name).is_file()), "")
 
 
 def _adaptation(folder: Path) -> Adaptation | None:

@@ -114,6 +114,7 @@ def _write_folder(
     page: ViewerPage, folder: Path, begun: list[PageFile], more: Iterable[PageFile], facts: dict[str, Any]
 ) -> tuple[Path, int]:
     """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of everything."""
+    page = replace(page, report=f"../{page.report}") if page.report else page  # the run's report lies beside the folder
     log.info(needs_text(page, folder / "index.html", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"))
     size = 0
     with store.atomic_directory(folder) as place:
