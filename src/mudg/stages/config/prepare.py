@@ -28,8 +28,8 @@ class IngestConfig:
     format: str = "auto"
     """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto = recognise it)."""
     frames: str = ""
-    """Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). KITTI: the numbers of its files; other formats:
-    counted from 0."""
+    """Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers of
+    their files; other formats: counted from 0."""
     cameras: tuple[str, ...] = ()
     """Cameras to import, by their names in the scene or in the dataset (empty = the format's default cameras)."""
     sequence: str = ""
