@@ -124,7 +124,7 @@ class CodecFeatures(nn.Module):
 
 WHOLE_PIXELS: Final = 2_500_000
 """Images of up to this many pixels (1920 x 1280 is just below) are compared in one piece."""
-BAND_PIXELS: Final = 600_000
+BAND_PIXELS: Final = 300_000
 LARGEST_PIXELS: Final = 2_500_000
 """Larger images are halved until they have no more, before they are compared in the features of the codec."""
 LpipsTrunk = Literal["alex", "vgg", "squeeze"]
@@ -316,7 +316,7 @@ def _padded(rows: int, step: int) -> int:
 
 
 def _bands(height: int, width: int, network: CodecFeatures) -> list[_Band]:
-    """An image cut so that the features of one band need about 300 MB."""
+    """An image cut so that a band takes less than 1 GB at any width."""
     step, reach = network.STEP, network.reach_rows
     rows = max(step, BAND_PIXELS // width // step * step)
     cuts = [*range(0, height, rows), height]
