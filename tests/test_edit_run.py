@@ -144,7 +144,7 @@ def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
         assert not out.exists()
     with pytest.raises(UsageError, match="input"):
         edit.run(EditConfig(), run, script(tmp_path, "- remove: {ids: [car]}"), run / "edited")
-    with pytest.raises(InputError, match="nothing that can be edited"):
+    with pytest.raises(InputError, match="no fitted scene"):
         edit.run(EditConfig(), run / "scene", tmp_path / "edits.yaml", out)
     assert not out.exists()
 

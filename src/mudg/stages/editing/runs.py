@@ -47,9 +47,9 @@ def find_run(folder: Path) -> RunParts:
     if not fits or scene is None or not (fused / "fuse.json").is_file():
         there = {"fit": bool(fits), "scene": scene is not None, "fuse": (fused / "fuse.json").is_file()}
         missing = [name for name, found in there.items() if not found]
-        raise InputError("this folder holds nothing that can be edited", where=str(folder),
+        raise InputError("this folder holds no fitted scene", where=str(folder),
             expected="a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`",
-            got=f"no {', no '.join(missing)}")  # fmt: skip
+            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder")  # fmt: skip
     return RunParts(fits, scene, fused, True)
 
 
