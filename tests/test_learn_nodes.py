@@ -1,11 +1,15 @@
 """Training under torchrun whose processes are killed, warned and changed in number: the losses of an uninterrupted run."""
 
+import contextlib
 import hashlib
 import json
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -34,6 +38,13 @@ def losses_of(out):
 
 
 def start(processes, clips, out, fault="", restarts=0, **changes):
+    nodes = ("--nnodes", "1", "--rdzv-endpoint", "127.0.0.1:0", "--max-restarts", str(restarts))
+    command, environment = torchrun(nodes, processes, clips, out, fault, **changes)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+
+
+def torchrun(nodes, processes, clips, out, fault="", **changes):
+    """Command and environment of a training with `processes` on this node."""
     flags = {
         "out": out, "steps": STEPS, "data.clips": clips, "data.cities": 3, "data.first-cities": 2, "data.held-out": 1,
         "data.width": WIDTH, "data.height": HEIGHT, "data.window": WINDOW, "data.clips-per-city": 2, "network.widths": "16 32",
@@ -46,14 +57,14 @@ def start(processes, clips, out, fault="", restarts=0, **changes):
     words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
     here = Path(__file__).parent
     command = [
-        sys.executable, "-m", "torch.distributed.run", "--nnodes", "1", "--rdzv-backend", "c10d", "--rdzv-endpoint", "127.0.0.1:0",
-        "--nproc-per-node", str(processes), "--max-restarts", str(restarts), str(here / "learn_on_nodes.py"), "learn", *words,
+        sys.executable, "-m", "torch.distributed.run", "--rdzv-backend", "c10d", *nodes, "--nproc-per-node", str(processes),
+        str(here / "learn_on_nodes.py"), "learn", *words,
     ]  # fmt: skip
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(here), *sys.path]), "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1", "FAULT": fault,
         "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",
     }  # fmt: skip
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+    return command, environment
 
 
 def test_two_processes_then_one_then_four(clips, tmp_path):
@@ -89,9 +100,56 @@ def test_two_processes_then_one_then_four(clips, tmp_path):
     assert len(list(newest.path.glob("net.*.safetensors"))) == 2  # of one replica
 
 
-def max_difference(one, other):
+def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
+    """Two nodes, each with its own torchrun; all of the second is killed without a word. `--nnodes 1:2` lets the first go on alone."""
+    steps = 30
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert start(1, clips, whole, steps=steps).returncode == 0
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    nodes = (
+        "--nnodes", "1:2", "--rdzv-id", "training", "--rdzv-endpoint", f"127.0.0.1:{port}", "--max-restarts", "3",
+        "--rdzv-conf", "last_call_timeout=5,keep_alive_interval=1,keep_alive_max_attempt=3",
+    )  # fmt: skip
+    said = [(tmp_path / f"node{number}").open("w+") for number in range(2)]
+    running = []
+    for number, end in enumerate(("is_host=true", "is_host=false")):
+        command, environment = torchrun((*nodes[:-1], f"{nodes[-1]},{end}"), 1, clips, out, steps=steps)
+        running.append(
+            subprocess.Popen(command, env=environment, stdout=said[number], stderr=subprocess.STDOUT)
+        )
+    try:
+        began = time.monotonic()
+        while not (out / "log.jsonl").is_file() or len(losses_of(out)) < 4:
+            assert time.monotonic() - began < 200 and running[1].poll() is None, Path(said[0].name).read_text()
+            time.sleep(0.05)
+        kill_all(running[1].pid)
+        assert running[0].wait(300) == 0, Path(said[0].name).read_text()
+    finally:
+        for one in running:
+            kill_all(one.pid)
+            one.wait()
+        for file in said:
+            file.close()
+    text = (tmp_path / "node0").read_text()
+    assert re.search(r"resuming at step \d+", text), text
+    assert checkpoint.latest(out / "steps").state["processes"] == 1
+    assert max_difference(whole, out, steps) < SAME
+
+
+def kill_all(pid):
+    """A process and all that it has started: torchrun gives every worker a session of its own."""
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in children.read_text().split():
+            kill_all(int(child))
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+
+
+def max_difference(one, other, steps=STEPS):
     first, second = losses_of(one), losses_of(other)
-    assert set(first) == set(second) == set(range(1, STEPS + 1))
+    assert set(first) == set(second) == set(range(1, steps + 1))
     return max(abs(first[step] - second[step]) / abs(first[step]) for step in first)
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import functools
+import inspect
 import json
 import math
 import os
@@ -201,7 +202,9 @@ class Spread:
         if ranks.size == 1:
             return
         if layout == "ddp":
-            self.network = nn.parallel.DistributedDataParallel(model, broadcast_buffers=False)
+            known = inspect.signature(nn.parallel.DistributedDataParallel).parameters
+            buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"  # since torch 2.13
+            self.network = nn.parallel.DistributedDataParallel(model, **{buffers: False})
             return
         from torch.distributed.device_mesh import init_device_mesh
         from torch.distributed.fsdp import fully_shard
