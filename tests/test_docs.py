@@ -26,7 +26,7 @@ PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
 FLAGS: dict[str, list[str]] = json.loads((REPOSITORY / "tests" / "house" / "cli.json").read_text(encoding="utf-8"))
 
-FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--standalone": "torchrun",
+FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--rdzv-conf": "torchrun", "--standalone": "torchrun",
                  "--version": "mudg", "--dist": "pytest", "--help": "every verb", "--help-all": "mudg run, mudg demo",
                  **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker"),
                  **dict.fromkeys(("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle",
