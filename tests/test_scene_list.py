@@ -10,6 +10,8 @@ import pytest
 import torch
 from toy_clips import tiny, write_clips
 
+from mudg import cli
+from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
@@ -170,6 +172,14 @@ def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
     assert json.loads((tmp_path / "local" / "metrics.json").read_text()) == json.loads(
         (tmp_path / "streamed" / "metrics.json").read_text()
     )
+
+
+def test_the_command_takes_an_address_of_clips(address, tmp_path, capsys):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(configuration.dump_yaml(tiny(address.text, steps=2)))
+    assert cli.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0, capsys.readouterr().err
+    assert cli.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
+    assert "a path of this machine" in capsys.readouterr().err
 
 
 def test_the_least_recently_used_clips_leave_the_cache(tmp_path):

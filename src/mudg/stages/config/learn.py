@@ -17,6 +17,8 @@ BelowOne = Annotated[float, Field(ge=0, lt=1)]
 class LearnData:
     """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
 
+    STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
+    """Settings that may be addresses of an object store."""
     width: int = Field(default=192, ge=32)
     """Width of the training images in pixels."""
     height: int = Field(default=128, ge=32)
