@@ -116,9 +116,7 @@ def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
     running = []
     for number, end in enumerate(("is_host=true", "is_host=false")):
         command, environment = torchrun((*nodes[:-1], f"{nodes[-1]},{end}"), 1, clips, out, steps=steps)
-        running.append(
-            subprocess.Popen(command, env=environment, stdout=said[number], stderr=subprocess.STDOUT)
-        )
+        running.append(subprocess.Popen(command, env=environment, stdout=said[number], stderr=subprocess.STDOUT))
     try:
         began = time.monotonic()
         while not (out / "log.jsonl").is_file() or len(losses_of(out)) < 4:
