@@ -112,6 +112,32 @@ def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None
         assert worth[one].min() >= worth[following].max()
 
 
+def test_the_first_picture_of_a_small_scene_is_of_half_a_chunk() -> None:
+    model = toy_fitted(degree=0)
+    visible = pack_scene(model, 0.0).layout.visible
+    half = -(-visible // 2)
+    assert pack_scene(model, 0.0, chunk_rows=half).layout.size == half // 2
+    assert pack_scene(model, 0.0, chunk_rows=half - 1).layout.size == half - 1
+    packed = pack_scene(model, 0.0, chunk_rows=visible)
+    assert [packed.chunk(k)[1]["level"] for k in range(len(packed.layout))] == [0, 1, 1][: len(packed.layout)]
+    assert packed.facts["chunk_rows"] == visible // 2
+
+
+def test_colours_and_displacements_are_kept_within_their_steps() -> None:
+    model = toy_fitted(degree=0)
+    packed = pack_scene(model, 0.0)
+    (sections, _), rows = packed.chunk(0), packed.layout.chunk(0)
+    red, green, blue, opacity = sections["color"]
+    levels = np.stack([red + green, green, blue + green], 1) / 255.0  # of bytes: modulo 256
+    span = packed.facts["color_high"] - packed.facts["color_low"]
+    true = np.clip(columns_of(model)["sh_dc"][rows, 0] * 0.28209479177387814 + 0.5, 0, packed.facts["color_high"])
+    assert np.abs(packed.facts["color_low"] + span * levels - true).max() <= span / 510 + 1e-6
+    assert np.abs(opacity / 255.0 - opacity_of(columns_of(model)["logits"])[rows]).max() <= 1 / 510 + 1e-6
+    (person,) = (node for node in model.nodes if node.kind == "deformable")
+    grid = person.offsets["deform"].detach().numpy().reshape(-1)
+    assert np.abs(packed.facts["deform_step"] * packed.sections["deform"] - grid).max() <= 0.51e-4
+
+
 def test_a_chunk_says_where_it_is_and_what_it_holds() -> None:
     model = toy_fitted(degree=3)
     packed = pack_scene(model, 0.0, chunk_rows=128)

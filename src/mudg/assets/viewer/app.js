@@ -46,8 +46,8 @@ export class App {
     this.cameras = new Cameras(this.drive, this.state);
     const tracks = facts.tracks.map((track) => ({ ...track, pose: new PoseKeys(log.keys.subarray(8 * track.keys[0], 8 * (track.keys[0] + track.keys[1]))) }));
     const sweeps = facts.lidar.map(({ t, first, count }) => {
-      const points = new Float32Array(3 * count);
-      for (let i = 0; i < 3 * count; i++) points[i] = facts.lidar_low[i % 3] + log.lidar[3 * first + i] * facts.lidar_step[i % 3];
+      const points = new Float32Array(3 * count), all = log.lidar.length / 3;
+      for (let i = 0; i < 3 * count; i++) points[i] = facts.lidar_low[i % 3] + log.lidar[(i % 3) * all + first + Math.floor(i / 3)] * facts.lidar_step[i % 3];
       return { t, points };
     });
     this.tracks = tracks;
