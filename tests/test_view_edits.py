@@ -32,6 +32,7 @@ from mudg.stages import edit, render
 from mudg.stages.config import EditConfig, RenderConfig
 from mudg.stages.config.view import PageConfig
 from mudg.stages.editing.carried import carry_out
+from mudg.stages.editing.weathered import conditions_of, in_weather, weather_of
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import edits as desk_module
 from mudg.stages.viewing import view
@@ -101,12 +102,26 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
         scene=0, layer="color", time_s=0.4, hidden=[], edits=SCRIPT, camera="front", width=80, height=48, fx=camera.fx, fy=camera.fy,
         cx=camera.cx, cy=camera.cy, eye=pose[:3, 3].tolist(), axes=pose[:3, :3].T.tolist(),
     )  # fmt: skip
-    seen = np.asarray(Image.open(io.BytesIO(FrameSource(desk.edited, 1600, torch.device("cpu")).png(asked)))) / 255.0
-    drive = carry_out(parse_edits(SCRIPT, "edits.yaml"), model, read_scene(toy[0] / "scene"))
-    true = render_view(drive.model(model), wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
+    scene = read_scene(toy[0] / "scene")
+    source = FrameSource(desk.edited, scene, 1600, torch.device("cpu"))
+
+    def drawn(script: str) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(source.png(asked.model_copy(update={"edits": script}))))) / 255.0
+
+    seen, edited = drawn(SCRIPT), carry_out(parse_edits(SCRIPT, "edits.yaml"), model, scene).model(model)
+    true = render_view(edited, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
     plain = render_view(model, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
     assert np.abs(seen - true).max() < 0.003
     assert np.abs(seen - plain).max() > 0.1
+    script = SCRIPT + "- weather: {rain: {mm_h: 30}, wet: 0.8}\n- light: {time: dusk}\n"
+    conditions = conditions_of(parse_edits(script, "edits.yaml").canonical())
+    assert conditions is not None
+    raster = raster_of(model)
+    how = weather_of(lambda one: render_view(edited, one, raster), conditions, scene)
+    wet = in_weather(lambda one: render_view(edited, one, raster), how)(wanted).rgb.permute(1, 2, 0).numpy()
+    assert np.abs(drawn(script) - wet).max() < 0.003
+    assert np.abs(drawn(script) - seen).max() > 0.1
+    assert np.abs(drawn(SCRIPT) - seen).max() == 0
 
 
 def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import http.client
 import http.server
 import json
 import re
@@ -21,6 +20,7 @@ import pytest
 import torch
 from browser import CHROMIUM, NO_BROWSER, Browser, BrowserError
 from toy_fitted import STREET, toy_fitted, write_toy_run
+from view_server import ask, serving
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
@@ -29,7 +29,7 @@ from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
 from mudg.report.viewer.chunks import coverage, level_of, morton_codes, opacity_of
 from mudg.report.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
-from mudg.stages.config.view import PageConfig, ViewConfig
+from mudg.stages.config.view import PageConfig
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import view
 from mudg.stages.viewing.server import token_for
@@ -488,28 +488,8 @@ def test_a_folder_opened_from_the_disk_says_what_to_do(
 
 @pytest.fixture(scope="module")
 def served(toy: tuple[Path, Path, SceneModel]) -> Iterator[tuple[int, str]]:
-    config = ViewConfig(images=0, browser=False, device="cpu")
-    server, site = view.server_of(config, toy[1], None, toy[0] / "scene")
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield server.server_address[1], site.token
-    finally:
-        server.shutdown()
-        server.server_close()
-
-
-def ask(port: int, method: str, path: str, body: object = None, **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(
-        method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named}
-    )
-    try:
-        with connection.getresponse() as answer:
-            return answer.status, answer.read()
-    finally:
-        connection.close()
+    with serving(toy[1], toy[0] / "scene") as found:
+        yield found
 
 
 def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> None:

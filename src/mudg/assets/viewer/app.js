@@ -16,6 +16,7 @@ const CERTAIN = 0.2; // certainty from which on a surface is called determined b
 const LONGEST_MS = 2500, LOADING_MS = 300; // of a picture at rest, and while chunks arrive: what would take longer is drawn smaller
 const PROBES = [SMALLEST, 0.4]; // sizes of the first pictures, which tell how long larger ones take
 const MOST_PIXELS = 2560 * 1440;
+const GROUND = ["road", "sidewalk", "terrain"]; // classes that snow covers
 
 export class App {
   /** @param facts of the page. @param parts {canvas, overlay, stage}: elements. */
@@ -44,6 +45,7 @@ export class App {
     progress(0.3);
     this.drive = new Drive(facts, log);
     this.cameras = new Cameras(this.drive, this.state);
+    this.renderer.velocity = (t) => this.drive.velocity(t);
     const tracks = facts.tracks.map((track) => ({ ...track, pose: new PoseKeys(log.keys.subarray(8 * track.keys[0], 8 * (track.keys[0] + track.keys[1]))) }));
     const sweeps = facts.lidar.map(({ t, first, count }) => {
       const points = new Float32Array(3 * count), all = log.lidar.length / 3;
@@ -54,7 +56,7 @@ export class App {
     this.ground = log.ground ?? null; // levels of heights
     for (const scene of facts.scenes) {
       const sections = sectionsOf(await inflate(await bytesOf(scene.file)), scene.directory);
-      this.loaded.push(this.renderer.load(new SplatScene(scene, sections)));
+      this.loaded.push(this.renderer.load(new SplatScene(scene, sections, GROUND.map((name) => facts.class_names.indexOf(name)))));
     }
     progress(0.5);
     for (const node of this.loaded[0].scene.nodes) { // boxes as the fit corrected them

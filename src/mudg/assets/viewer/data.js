@@ -93,9 +93,9 @@ export function unpacked({ block, block_of: blockOf, position, scale, rotation, 
 /** A scene as the page keeps it, without its Gaussians: sky, nodes with their poses, how large its texture is. */
 export class SplatScene {
   /**
-   * @param facts the scene's entry in the page's facts. @param sections see `sectionsOf`.
+   * @param facts the scene's entry in the page's facts. @param sections see `sectionsOf`. @param grounds ids of the classes of ground.
    */
-  constructor(facts, sections) {
+  constructor(facts, sections, grounds) {
     this.facts = facts;
     this.rows = facts.rows;
     this.chunkRows = Math.max(1, Math.min(facts.chunk_rows, facts.rows));
@@ -103,6 +103,7 @@ export class SplatScene {
     this.hasCertainty = facts.certainty;
     this.texels = 2 + Math.ceil([0, 3, 6, 12][facts.degree] / 4); // 9, 24 and 45 bytes of harmonics
     this.layerHeight = Math.ceil(this.chunkRows * this.texels / TEXTURE_WIDTH);
+    this.ground = facts.classes.reduce((bits, id, k) => (k < 32 && grounds.includes(id) ? bits | (1 << k) : bits), 0) >>> 0;
     this.nodes = facts.nodes.map((node) => ({ ...node, pose: node.keys
       ? new PoseKeys(sections.keys.subarray(8 * node.keys[0], 8 * (node.keys[0] + node.keys[1]))) : null }));
     this.deform = sections.deform;

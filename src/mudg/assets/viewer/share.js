@@ -6,9 +6,10 @@ import { toHash } from "mudg/state";
 import { zipOf } from "mudg/zip";
 
 const MOST_SIDE = 8192;
-const FRAMES_PER_S = 10;
+/** Of videos and of the pictures of a drive. */
+export const FRAMES_PER_S = 10;
 
-function save(blob, name) {
+export function save(blob, name) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
   link.download = name;
@@ -16,7 +17,7 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
+export const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
 
 /** What is shown, `times` as large, on a canvas of its own; boxes and points are drawn on it as on the page. */
 function sheetOf(app, times) {
@@ -42,11 +43,14 @@ export async function savePicture(app, times) {
   return blob.size;
 }
 
+/** How many pictures a drive has. */
+export const framesOf = (app) => Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1;
+
 /** Saves the whole drive as pictures in an archive: each is drawn in full, however long that takes. Asked for once more, it ends early. */
 export async function saveFrames(app, say) {
   if (app.saving) { app.saving = false; return; }
   app.saving = true;
-  const { t, playing } = app.state, count = Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1, files = [];
+  const { t, playing } = app.state, count = framesOf(app), files = [];
   try {
     for (let k = 0; k < count && app.saving; k++) {
       say(`Frame ${k + 1} of ${count}. Frames ends it.`);

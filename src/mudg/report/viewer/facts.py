@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base import palette
+from mudg.base import palette, seeds
 from mudg.base.camera_colors import CameraColors
 from mudg.base.types import Camera, Frame, Scene
 from mudg.core.ground import HeightMap
 from mudg.core.pictures import depth_colors, resize_area
+from mudg.core.weather.particles import FLAKE_EDGES_MM, RAIN_EDGES_MM
 from mudg.data.scene import read_image, read_points
 from mudg.report.page import FAR_M, NEAR_M
 from mudg.report.viewer.packed import Sections, key_rows
@@ -97,6 +98,15 @@ def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
     levels = np.where(np.isfinite(ground.heights), np.rint((ground.heights - low) / step), UNKNOWN).astype(np.uint16)
     record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape), "low": low, "step": step}
     return replace(page, facts=page.facts | {"ground": record}, sections=page.sections | {"ground": levels})
+
+
+def with_particles(page: PageFacts, seed: int) -> PageFacts:
+    """The page with the keys of random drops and flakes, so that it draws those of a render with this seed."""
+    keys = {
+        name: [seeds.key(seed, index, purpose) & 0x7FFFFFFF for index in range(len(edges) - 1)]
+        for name, purpose, edges in (("rain", "rain", RAIN_EDGES_MM), ("snow", "flakes", FLAKE_EDGES_MM))
+    }
+    return replace(page, facts=page.facts | {"particle_keys": keys})
 
 
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:

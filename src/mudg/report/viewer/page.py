@@ -24,8 +24,8 @@ TEXELS: Final = (2, 3, 4, 5)
 SORT_BYTES: Final = 38
 """Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 MODULES: Final = (
-    "math", "data", "sorter", "shaders", "edits", "weather", "renderer", "cameras", "state", "overlay", "arrival", "app", "zip", "share",
-    "gizmo", "editor", "ui", "input", "exact", "main",
+    "math", "data", "sorter", "shaders", "edits", "particles", "weather", "renderer", "cameras", "state", "overlay", "arrival", "app",
+    "zip", "share", "gizmo", "editor", "ui", "input", "exact", "main",
 )  # fmt: skip
 
 
@@ -123,7 +123,7 @@ class ViewerPage:
             css=Markup(asset("viewer.css")), import_map=Markup(imports), policy=policy(imports, entry),  # noqa: S704
             size=f"{size / 1e6:.1f} MB", near=f"{near:g}", far=f"{far:g}", class_legend=html.class_legend(),
             notes=[note for _, packed in self.scenes for note in packed.notes],
-            payloads=inside, facts=Markup(script_json(facts)), entry=Markup(entry),  # noqa: S704
+            payloads=inside, live=self.live is not None, facts=Markup(script_json(facts)), entry=Markup(entry),  # noqa: S704
         )  # fmt: skip
         return text.encode()
 
