@@ -27,7 +27,7 @@ from mudg.base.palette import ID
 from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
-from mudg.report.viewer.chunks import coverage, level_of, morton_codes, opacity_of
+from mudg.report.viewer.chunks import chunk_rows, coverage, level_of, morton_codes, opacity_of
 from mudg.report.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
 from mudg.stages.config.view import PageConfig
 from mudg.stages.fitting.rendering import raster_of, render_view
@@ -270,6 +270,25 @@ def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, S
     assert said.count("500 Gaussians of 900 (") == 1
     assert f"{kept.layout.visible - 500} left out for the budget" in said
     assert page.graphics_bytes() == 500 * (5 * 16 + 4)  # degree 3: five texels
+
+
+def test_a_page_stays_within_the_memory_that_it_may_take(
+    toy: tuple[Path, Path, SceneModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mudg.data.scene import read_scene
+
+    for degree in range(4):
+        for size in (64, 65_536):
+            for limit in (5_000, 60_000, 1_234_567, 300_000_000):
+                most = viewer_page.most_within(limit, degree, size)
+                taken = [sum(viewer_page.scene_bytes(n, chunk_rows(n, size), degree)) for n in (most, most + 1)]
+                assert taken[0] <= limit < taken[1]
+    shown = view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]), ("fit", toy[2])))
+    monkeypatch.setattr(view, "MEGABYTE", 1e5)
+    page = view.page_of(PageConfig(images=0, memory_mb=1), shown)
+    assert 9e4 < page.graphics_bytes() + page.heap_bytes() <= 1e5
+    assert f"{page.scenes[0][1].layout.visible - page.scenes[0][1].kept} left out for the budget" in view.needs_text(page, "page.html", "")
+    assert view.page_of(PageConfig(images=0, memory_mb=1, budget=100), shown).scenes[0][1].kept == 100
 
 
 def whole_page(page: viewer_page.ViewerPage) -> bytes:

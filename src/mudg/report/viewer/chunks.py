@@ -84,10 +84,15 @@ def lay_out(
     if len(ranks) > MOST_CHUNKS * size:
         raise UsageError("more Gaussians than a page can hold", where="--budget", got=f"{len(ranks):,}",
                          expected=f"at most {MOST_CHUNKS * size:,}", remedy="set --budget to keep those that cover most")  # fmt: skip
-    rows, size = rows[ranks], max(1, size // 2) if len(ranks) <= SMALL * size else size
+    rows, size = rows[ranks], chunk_rows(len(ranks), size)
     level = np.repeat([np.int8(level_of(k)) for k in range(-(-len(rows) // size))], size)[: len(rows)]
     order = np.lexsort((morton_codes(columns["means"], node, rows), node[rows], level))
     return Layout(rows[order], size, len(node), visible, lost)
+
+
+def chunk_rows(rows: int, size: int = CHUNK) -> int:
+    """Rows per chunk of a scene with so many: half of ``size`` in a small scene."""
+    return max(1, size // 2) if rows <= SMALL * size else size
 
 
 def opacity_of(logits: NDArray[np.floating]) -> NDArray[np.float64]:
