@@ -392,6 +392,18 @@ def test_fog_and_light_are_previewed_and_saved(opened: Browser, toy: Toy, tmp_pa
 
 
 @pytest.mark.slow
+def test_a_picture_is_as_large_as_asked(opened: Browser) -> None:
+    opened.run("mudg.editor.set([]); window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'data:,'; }; 1")
+    opened.wait("mudg.sharp")
+    for times in (1, 2):
+        opened.run(f"import('mudg/share').then((share) => share.savePicture(mudg, {times}))")
+    shown = opened.run("[mudg.last.view.width, mudg.last.view.height]")
+    one, two = opened.run("Promise.all(kept.map((b) => createImageBitmap(b).then((i) => [i.width, i.height])))")
+    assert one == shown
+    assert two == [2 * side for side in shown]
+
+
+@pytest.mark.slow
 def test_a_drive_is_saved_as_frames(opened: Browser, tmp_path: Path) -> None:
     opened.run("mudg.editor.set([]); URL.createObjectURL = () => 'data:,'; 1")
     text = opened.run(

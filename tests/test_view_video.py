@@ -253,3 +253,35 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
             assert one.errors == []
         finally:
             one.close()
+
+
+PIXELS = """(() => { const {area} = mudg.last, c = document.createElement('canvas'), x = c.getContext('2d'); c.width = 64; c.height = 32;
+  x.drawImage(SOURCE, 0, 0, 64, 32); return [...x.getImageData(0, 0, 64, 32).data].filter((_, k) => k % 4 < 3); })()"""
+
+
+def drawn(page: Browser, source: str) -> np.ndarray:
+    """A picture of the page, small, f64[32, 64, 3]."""
+    return np.array(page.run(PIXELS.replace("SOURCE", source)), float).reshape(32, 64, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
+def test_exact_frames_are_compared_with_what_they_are_compared_with(toy: Toy, tmp_path: Path) -> None:
+    shown = "document.getElementById('canvas'), ...mudg.last.area"
+    with serving(toy[1], toy[0] / "scene", compare=toy[1], images=5) as (port, token):
+        one = Browser(tmp_path / "profile", size=(700, 500))
+        try:
+            one.open(f"http://127.0.0.1:{port}/?token={token}#m=recorded&c=front&t=0.4&v=divider-recorded&d=0")
+            one.wait("!document.getElementById('exact').hidden")
+            photograph = drawn(one, "mudg.image(mudg.drive.nearestFrame('front', 0.4))")
+            assert np.abs(drawn(one, shown)[:, 4:] - photograph[:, 4:]).mean() < 6
+            one.run("mudg.change({divider: 1}); 1")
+            one.wait("!document.getElementById('exact').hidden")
+            assert np.abs(drawn(one, shown) - photograph).mean() > 12
+            one.run("mudg.change({compare: 'difference-scene'}); 1")  # the same fit twice
+            one.wait("!document.getElementById('exact').hidden")
+            assert one.run("mudg.exact.images.length") == 2
+            assert drawn(one, shown).max() == 0
+            assert one.errors == []
+        finally:
+            one.close()

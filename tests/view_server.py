@@ -15,10 +15,12 @@ from mudg.stages.viewing.edits import EditFiles
 
 
 @contextmanager
-def serving(fit: Path, scene: Path, files: EditFiles | None = None, **settings: object) -> Iterator[tuple[int, str]]:
+def serving(
+    fit: Path, scene: Path, compare: Path | None = None, files: EditFiles | None = None, **settings: object
+) -> Iterator[tuple[int, str]]:
     """Port and token of a server of a fit."""
     config = ViewConfig(**{"images": 0, "browser": False, "device": "cpu", **settings})
-    server, site = view.server_of(config, fit, None, scene, files)
+    server, site = view.server_of(config, fit, compare, scene, files)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         yield server.server_address[1], site.token

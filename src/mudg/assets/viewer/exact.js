@@ -28,13 +28,15 @@ export function exactFrames(app) {
     answered = app.changed;
     current = new AbortController();
     const view = app.last.view, asked = app.changed;
-    const body = { ...wanted(app, view), time_s: s.t + app.facts.begin_s, eye: view.eye, axes: view.axes };
+    const body = { ...wanted(app, view), time_s: s.t + app.facts.begin_s, eye: view.eye, axes: view.axes }, images = [];
     try {
-      const answer = await ask(app, "frame", body, current.signal);
-      if (!answer.ok) throw new Error(await answer.text());
-      const image = await createImageBitmap(await answer.blob(), { colorSpaceConversion: "none" });
+      for (const scene of app.used().right?.scene ? [s.scene, 1 - s.scene] : [s.scene]) { // of two scenes both, so that they are compared alike
+        const answer = await ask(app, "frame", { ...body, scene }, current.signal);
+        if (!answer.ok) throw new Error(await answer.text());
+        images.push(await createImageBitmap(await answer.blob(), { colorSpaceConversion: "none" }));
+      }
       if (app.changed !== asked) return; // the camera has moved on
-      app.exact = { key: `exact ${asked}`, image };
+      app.exact = { key: asked, images };
       app.draw(1, false);
       app.sharp = true;
       badge.hidden = false;

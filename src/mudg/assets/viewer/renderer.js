@@ -45,7 +45,7 @@ export class Renderer {
     this.nodes = gl.createTexture();
     this.grids = gl.createTexture();
     this.empty = gl.createVertexArray();
-    this.photo = { key: null, texture: null };
+    this.photos = new Map(); // place -> {key, texture}
     this.conditions = conditionsOf([]);
     this.velocity = () => [0, 0, 0]; // of the vehicle at a time, m/s; it tilts the streaks of drops
     this.drops = this.program(shaders.dropVertex, shaders.dropFragment);
@@ -326,18 +326,18 @@ export class Renderer {
     return picture;
   }
 
-  /** A photograph, or an exact frame, as a picture; kept until another one comes. */
-  photograph(key, image) {
-    if (this.photo.key !== key) {
+  /** A photograph, or an exact frame, as a picture; kept until another one comes to its place. */
+  photograph(place, key, image) {
+    if (this.photos.get(place)?.key !== key) {
       const gl = this.gl;
-      if (this.photo.texture) gl.deleteTexture(this.photo.texture);
+      if (this.photos.has(place)) gl.deleteTexture(this.photos.get(place).texture);
       const made = gl.createTexture();
       gl.bindTexture(gl.TEXTURE_2D, made);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
       this.filtered(gl.LINEAR);
-      this.photo = { key, texture: made };
+      this.photos.set(place, { key, texture: made });
     }
-    return { textures: [this.photo.texture], image: true };
+    return { textures: [this.photos.get(place).texture], image: true };
   }
 
   /**

@@ -24,8 +24,9 @@ function sheetOf(app, times) {
   const { canvas, overlay, renderer, state } = app, whole = app.last.view, factor = Math.min(times, MOST_SIDE / Math.max(whole.width, whole.height));
   const before = [canvas.width, canvas.height], view = scaled(whole, factor), { left, right, mode } = app.used();
   Object.assign(canvas, { width: view.width, height: view.height });
-  renderer.present(app.pictureOf("left", left, view) ?? app.pictureOf("left", left, view, "color"),
-    right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null, [0, 0, view.width, view.height], mode, state.divider);
+  const pictures = [app.pictureOf("left", left, view) ?? app.pictureOf("left", left, view, "color"), right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null];
+  if (view === whole) app.putExact(pictures);
+  renderer.present(...pictures, [0, 0, view.width, view.height], mode, state.divider);
   const sheet = Object.assign(document.createElement("canvas"), { width: view.width, height: view.height }), c = sheet.getContext("2d");
   c.drawImage(canvas, 0, 0);
   if (overlay.style.visibility !== "hidden") c.drawImage(overlay, ...app.last.area, 0, 0, view.width, view.height);

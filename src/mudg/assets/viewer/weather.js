@@ -13,7 +13,7 @@ export const LIGHTS = {
 };
 const EXTINCTION = 3; // Koschmieder: at the distance of the visibility 5 % are left
 const MOST_REACH_M = 8; // of drops and flakes that are drawn one by one; the others are a veil
-const SNOW = 1.1; // of the light of the horizon
+const SNOW = [0.55, 0.4]; // its brightness: a part of its own, and one of the light of the horizon
 const DAYLIGHT = [0.76, 0.79, 0.82]; // of fog where a scene has no sky
 
 const last = (edits, verb) => edits.map(verbOf).findLast(([name]) => name === verb)?.[1];
@@ -32,7 +32,7 @@ export function conditionsOf(edits) {
 export function preview(c, sky) {
   const [, factor, saturation] = LIGHTS[c.time], air = horizon(sky);
   return {
-    fog: [...air, c.visibility_m ? EXTINCTION / c.visibility_m : 0], light: [...factor, saturation], snow: [...air.map((v) => v * SNOW), c.cover],
+    fog: [...air, c.visibility_m ? EXTINCTION / c.visibility_m : 0], light: [...factor, saturation], snow: [...air.map((v) => SNOW[0] + SNOW[1] * v), c.cover],
     veil: [rainExtinction(c.rain_mm_h), c.rain_reach, snowExtinction(c.snow_mm_h), c.snow_reach],
   };
 }
