@@ -392,6 +392,30 @@ def test_fog_and_light_are_previewed_and_saved(opened: Browser, toy: Toy, tmp_pa
 
 
 @pytest.mark.slow
+def test_boxes_beside_the_camera_are_cut_and_not_left_out(opened: Browser) -> None:
+    camera = {"eye": [0, 0, 0], "axes": [[0, -1, 0], [0, 0, -1], [1, 0, 0]], "fx": 100, "fy": 100, "cx": 50, "cy": 40}
+
+    def ahead(p: list[float], q: list[float]) -> list[list[float]] | None:
+        return opened.run(f"import('mudg/overlay').then((o) => o.ahead({json.dumps(camera)}, {p}, {q}))")
+
+    assert ahead([-2, 0, 0], [-1, 1, 0]) is None
+    assert np.allclose(ahead([1, 1, 0], [2, 1, 0]), [[-50, 40, 1], [0, 40, 2]])
+    assert np.allclose(ahead([-2, 1, 0], [2, 1, 0]), [[-350, 40, 0.25], [0, 40, 2]])
+    assert np.allclose(ahead([2, 1, 0], [-2, 1, 0]), [[0, 40, 2], [-350, 40, 0.25]])
+    opened.run("mudg.change({mode: 'fly', eye: [0, 0, 1.5], yaw: 0, pitch: 0, boxes: true, t: 0.4}); 1")
+    opened.wait("mudg.sharp")
+    count = (
+        "(() => { const o = mudg.overlay, p = o.getContext('2d').getImageData(0, 0, o.width, o.height).data; let n = 0;"
+        "for (let i = 3; i < p.length; i += 4) if (p[i]) n++; return n; })()"
+    )
+    center = opened.run("mudg.tracks.find((one) => one.id === 'car-1').pose.at(0.4).position")
+    opened.run(f"mudg.change({{eye: [{center[0]}, {center[1] + 2}, {center[2]}]}}); 1")  # beside its middle, half of it is behind
+    opened.wait("mudg.sharp")
+    assert opened.run(count) > 500
+    opened.run("mudg.change({mode: 'recorded', boxes: false}); 1")
+
+
+@pytest.mark.slow
 def test_a_picture_is_as_large_as_asked(opened: Browser) -> None:
     opened.run("mudg.editor.set([]); window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'data:,'; }; 1")
     opened.wait("mudg.sharp")
