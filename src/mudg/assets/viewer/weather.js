@@ -13,7 +13,7 @@ export const LIGHTS = {
 };
 const EXTINCTION = 3; // Koschmieder: at the distance of the visibility 5 % are left
 const MOST_REACH_M = 8; // of drops and flakes that are drawn one by one; the others are a veil
-const SNOW = [0.55, 0.4]; // its brightness: a part of its own, and one of the light of the horizon
+const SNOW = [0.75, 0.22]; // its brightness: a part of its own, and one of the light of the horizon
 const DAYLIGHT = [0.76, 0.79, 0.82]; // of fog where a scene has no sky
 
 const last = (edits, verb) => edits.map(verbOf).findLast(([name]) => name === verb)?.[1];
