@@ -32,6 +32,7 @@ from mudg.stages import edit, render
 from mudg.stages.config import EditConfig, RenderConfig
 from mudg.stages.config.view import PageConfig
 from mudg.stages.editing.carried import carry_out
+from mudg.stages.editing.weathered import conditions_of, in_weather, weather_of
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import edits as desk_module
 from mudg.stages.viewing import view
@@ -101,12 +102,26 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
         scene=0, layer="color", time_s=0.4, hidden=[], edits=SCRIPT, camera="front", width=80, height=48, fx=camera.fx, fy=camera.fy,
         cx=camera.cx, cy=camera.cy, eye=pose[:3, 3].tolist(), axes=pose[:3, :3].T.tolist(),
     )  # fmt: skip
-    seen = np.asarray(Image.open(io.BytesIO(FrameSource(desk.edited, 1600, torch.device("cpu")).png(asked)))) / 255.0
-    drive = carry_out(parse_edits(SCRIPT, "edits.yaml"), model, read_scene(toy[0] / "scene"))
-    true = render_view(drive.model(model), wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
+    scene = read_scene(toy[0] / "scene")
+    source = FrameSource(desk.edited, scene, 1600, torch.device("cpu"))
+
+    def drawn(script: str) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(source.png(asked.model_copy(update={"edits": script}))))) / 255.0
+
+    seen, edited = drawn(SCRIPT), carry_out(parse_edits(SCRIPT, "edits.yaml"), model, scene).model(model)
+    true = render_view(edited, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
     plain = render_view(model, wanted, raster_of(model)).rgb.permute(1, 2, 0).numpy()
     assert np.abs(seen - true).max() < 0.003
     assert np.abs(seen - plain).max() > 0.1
+    script = SCRIPT + "- weather: {rain: {mm_h: 30}, wet: 0.8}\n- light: {time: dusk}\n"
+    conditions = conditions_of(parse_edits(script, "edits.yaml").canonical())
+    assert conditions is not None
+    raster = raster_of(model)
+    how = weather_of(lambda one: render_view(edited, one, raster), conditions, scene)
+    wet = in_weather(lambda one: render_view(edited, one, raster), how)(wanted).rgb.permute(1, 2, 0).numpy()
+    assert np.abs(drawn(script) - wet).max() < 0.003
+    assert np.abs(drawn(script) - seen).max() > 0.1
+    assert np.abs(drawn(SCRIPT) - seen).max() == 0
 
 
 def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_path: Path) -> None:
@@ -374,6 +389,42 @@ def test_fog_and_light_are_previewed_and_saved(opened: Browser, toy: Toy, tmp_pa
     opened.run(set_to.format("fog", 0))
     assert opened.run("mudg.state.edits.length") == 0
     assert opened.run(picture) == pytest.approx(plain, abs=0.01)
+
+
+@pytest.mark.slow
+def test_boxes_beside_the_camera_are_cut_and_not_left_out(opened: Browser) -> None:
+    camera = {"eye": [0, 0, 0], "axes": [[0, -1, 0], [0, 0, -1], [1, 0, 0]], "fx": 100, "fy": 100, "cx": 50, "cy": 40}
+
+    def ahead(p: list[float], q: list[float]) -> list[list[float]] | None:
+        return opened.run(f"import('mudg/overlay').then((o) => o.ahead({json.dumps(camera)}, {p}, {q}))")
+
+    assert ahead([-2, 0, 0], [-1, 1, 0]) is None
+    assert np.allclose(ahead([1, 1, 0], [2, 1, 0]), [[-50, 40, 1], [0, 40, 2]])
+    assert np.allclose(ahead([-2, 1, 0], [2, 1, 0]), [[-350, 40, 0.25], [0, 40, 2]])
+    assert np.allclose(ahead([2, 1, 0], [-2, 1, 0]), [[0, 40, 2], [-350, 40, 0.25]])
+    opened.run("mudg.change({mode: 'fly', eye: [0, 0, 1.5], yaw: 0, pitch: 0, boxes: true, t: 0.4}); 1")
+    opened.wait("mudg.sharp")
+    count = (
+        "(() => { const o = mudg.overlay, p = o.getContext('2d').getImageData(0, 0, o.width, o.height).data; let n = 0;"
+        "for (let i = 3; i < p.length; i += 4) if (p[i]) n++; return n; })()"
+    )
+    center = opened.run("mudg.tracks.find((one) => one.id === 'car-1').pose.at(0.4).position")
+    opened.run(f"mudg.change({{eye: [{center[0]}, {center[1] + 2}, {center[2]}]}}); 1")  # beside its middle, half of it is behind
+    opened.wait("mudg.sharp")
+    assert opened.run(count) > 500
+    opened.run("mudg.change({mode: 'recorded', boxes: false}); 1")
+
+
+@pytest.mark.slow
+def test_a_picture_is_as_large_as_asked(opened: Browser) -> None:
+    opened.run("mudg.editor.set([]); window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'data:,'; }; 1")
+    opened.wait("mudg.sharp")
+    for times in (1, 2):
+        opened.run(f"import('mudg/share').then((share) => share.savePicture(mudg, {times}))")
+    shown = opened.run("[mudg.last.view.width, mudg.last.view.height]")
+    one, two = opened.run("Promise.all(kept.map((b) => createImageBitmap(b).then((i) => [i.width, i.height])))")
+    assert one == shown
+    assert two == [2 * side for side in shown]
 
 
 @pytest.mark.slow

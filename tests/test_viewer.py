@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import http.client
 import http.server
 import json
 import re
@@ -21,15 +20,16 @@ import pytest
 import torch
 from browser import CHROMIUM, NO_BROWSER, Browser, BrowserError
 from toy_fitted import STREET, toy_fitted, write_toy_run
+from view_server import ask, serving
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
-from mudg.report.viewer.chunks import coverage, level_of, morton_codes, opacity_of
+from mudg.report.viewer.chunks import chunk_rows, coverage, level_of, morton_codes, opacity_of
 from mudg.report.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
-from mudg.stages.config.view import PageConfig, ViewConfig
+from mudg.stages.config.view import PageConfig
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import view
 from mudg.stages.viewing.server import token_for
@@ -110,6 +110,32 @@ def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None
     levels = [np.concatenate([c for k, c in enumerate(chunks) if level_of(k) == n]) for n in range(level_of(len(chunks) - 1) + 1)]
     for one, following in zip(levels, levels[1:]):
         assert worth[one].min() >= worth[following].max()
+
+
+def test_the_first_picture_of_a_small_scene_is_of_half_a_chunk() -> None:
+    model = toy_fitted(degree=0)
+    visible = pack_scene(model, 0.0).layout.visible
+    half = -(-visible // 2)
+    assert pack_scene(model, 0.0, chunk_rows=half).layout.size == half // 2
+    assert pack_scene(model, 0.0, chunk_rows=half - 1).layout.size == half - 1
+    packed = pack_scene(model, 0.0, chunk_rows=visible)
+    assert [packed.chunk(k)[1]["level"] for k in range(len(packed.layout))] == [0, 1, 1][: len(packed.layout)]
+    assert packed.facts["chunk_rows"] == visible // 2
+
+
+def test_colours_and_displacements_are_kept_within_their_steps() -> None:
+    model = toy_fitted(degree=0)
+    packed = pack_scene(model, 0.0)
+    (sections, _), rows = packed.chunk(0), packed.layout.chunk(0)
+    red, green, blue, opacity = sections["color"]
+    levels = np.stack([red + green, green, blue + green], 1) / 255.0  # of bytes: modulo 256
+    span = packed.facts["color_high"] - packed.facts["color_low"]
+    true = np.clip(columns_of(model)["sh_dc"][rows, 0] * 0.28209479177387814 + 0.5, 0, packed.facts["color_high"])
+    assert np.abs(packed.facts["color_low"] + span * levels - true).max() <= span / 510 + 1e-6
+    assert np.abs(opacity / 255.0 - opacity_of(columns_of(model)["logits"])[rows]).max() <= 1 / 510 + 1e-6
+    (person,) = (node for node in model.nodes if node.kind == "deformable")
+    grid = person.offsets["deform"].detach().numpy().reshape(-1)
+    assert np.abs(packed.facts["deform_step"] * packed.sections["deform"] - grid).max() <= 0.51e-4
 
 
 def test_a_chunk_says_where_it_is_and_what_it_holds() -> None:
@@ -244,6 +270,25 @@ def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, S
     assert said.count("500 Gaussians of 900 (") == 1
     assert f"{kept.layout.visible - 500} left out for the budget" in said
     assert page.graphics_bytes() == 500 * (5 * 16 + 4)  # degree 3: five texels
+
+
+def test_a_page_stays_within_the_memory_that_it_may_take(
+    toy: tuple[Path, Path, SceneModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mudg.data.scene import read_scene
+
+    for degree in range(4):
+        for size in (64, 65_536):
+            for limit in (5_000, 60_000, 1_234_567, 300_000_000):
+                most = viewer_page.most_within(limit, degree, size)
+                taken = [sum(viewer_page.scene_bytes(n, chunk_rows(n, size), degree)) for n in (most, most + 1)]
+                assert taken[0] <= limit < taken[1]
+    shown = view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]), ("fit", toy[2])))
+    monkeypatch.setattr(view, "MEGABYTE", 1e5)
+    page = view.page_of(PageConfig(images=0, memory_mb=1), shown)
+    assert 9e4 < page.graphics_bytes() + page.heap_bytes() <= 1e5
+    assert f"{page.scenes[0][1].layout.visible - page.scenes[0][1].kept} left out for the budget" in view.needs_text(page, "page.html", "")
+    assert view.page_of(PageConfig(images=0, memory_mb=1, budget=100), shown).scenes[0][1].kept == 100
 
 
 def whole_page(page: viewer_page.ViewerPage) -> bytes:
@@ -462,28 +507,8 @@ def test_a_folder_opened_from_the_disk_says_what_to_do(
 
 @pytest.fixture(scope="module")
 def served(toy: tuple[Path, Path, SceneModel]) -> Iterator[tuple[int, str]]:
-    config = ViewConfig(images=0, browser=False, device="cpu")
-    server, site = view.server_of(config, toy[1], None, toy[0] / "scene")
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield server.server_address[1], site.token
-    finally:
-        server.shutdown()
-        server.server_close()
-
-
-def ask(port: int, method: str, path: str, body: object = None, **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(
-        method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named}
-    )
-    try:
-        with connection.getresponse() as answer:
-            return answer.status, answer.read()
-    finally:
-        connection.close()
+    with serving(toy[1], toy[0] / "scene") as found:
+        yield found
 
 
 def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> None:

@@ -399,6 +399,15 @@ def test_every_effect_is_finite_repeatable_and_visible(name: str) -> None:
     assert 0 <= shown.min() <= shown.max() <= 1
 
 
+def test_snow_that_has_fallen_leaves_a_sky_without_end_as_it_is() -> None:
+    view = forward_view()
+    scene = street(view)
+    far = np.full_like(scene.depth, np.inf)  # below the horizon, too: nothing was seen there
+    scene = from_render(view, scene.color, far, np.full_like(scene.classes, ID["sky"]))
+    shown = weather.apply(scene, conditions(snow=SnowSettings(cover=0.7)), view, 0.4, 7)
+    np.testing.assert_allclose(shown.color, scene.color, atol=1e-6)
+
+
 def test_settings_go_through_plain_values_and_refuse_what_is_out_of_range() -> None:
     for case in CASES.values():
         assert build(Conditions, to_dict(case), "edits") == case

@@ -16,6 +16,7 @@ const CERTAIN = 0.2; // certainty from which on a surface is called determined b
 const LONGEST_MS = 2500, LOADING_MS = 300; // of a picture at rest, and while chunks arrive: what would take longer is drawn smaller
 const PROBES = [SMALLEST, 0.4]; // sizes of the first pictures, which tell how long larger ones take
 const MOST_PIXELS = 2560 * 1440;
+const GROUND = ["road", "sidewalk", "terrain"]; // classes that snow covers
 
 export class App {
   /** @param facts of the page. @param parts {canvas, overlay, stage}: elements. */
@@ -44,17 +45,18 @@ export class App {
     progress(0.3);
     this.drive = new Drive(facts, log);
     this.cameras = new Cameras(this.drive, this.state);
+    this.renderer.velocity = (t) => this.drive.velocity(t);
     const tracks = facts.tracks.map((track) => ({ ...track, pose: new PoseKeys(log.keys.subarray(8 * track.keys[0], 8 * (track.keys[0] + track.keys[1]))) }));
     const sweeps = facts.lidar.map(({ t, first, count }) => {
-      const points = new Float32Array(3 * count);
-      for (let i = 0; i < 3 * count; i++) points[i] = facts.lidar_low[i % 3] + log.lidar[3 * first + i] * facts.lidar_step[i % 3];
+      const points = new Float32Array(3 * count), all = log.lidar.length / 3;
+      for (let i = 0; i < 3 * count; i++) points[i] = facts.lidar_low[i % 3] + log.lidar[(i % 3) * all + first + Math.floor(i / 3)] * facts.lidar_step[i % 3];
       return { t, points };
     });
     this.tracks = tracks;
     this.ground = log.ground ?? null; // levels of heights
     for (const scene of facts.scenes) {
       const sections = sectionsOf(await inflate(await bytesOf(scene.file)), scene.directory);
-      this.loaded.push(this.renderer.load(new SplatScene(scene, sections)));
+      this.loaded.push(this.renderer.load(new SplatScene(scene, sections, GROUND.map((name) => facts.class_names.indexOf(name)))));
     }
     progress(0.5);
     for (const node of this.loaded[0].scene.nodes) { // boxes as the fit corrected them
@@ -120,7 +122,7 @@ export class App {
       if (t > end && !s.loop) this.change({ t: end, playing: false });
       else this.change({ t: t > end ? 0 : Math.max(0, t) });
     }
-    this.move?.(Math.min(0.1, (now - (this.before ?? now)) / 1000));
+    this.move?.(Math.min(0.25, (now - (this.before ?? now)) / 1000));
     this.before = now;
     if (this.fresh && now - this.drawnAt > Math.max(FRESH_MS, FRESH_TIMES * this.drawMs)) { // more Gaussians, but not at the cost of the controls
       this.fresh = false;
@@ -167,7 +169,7 @@ export class App {
     if (!left.drawn) return;
     const below = [area[0], height - area[1] - area[3], area[2], area[3]];
     const pictures = [this.pictureOf("left", left, small), right === "recorded" ? this.photo() : right ? this.pictureOf("right", right, small) : null];
-    if (this.exact) pictures[0] = this.renderer.photograph(this.exact.key, this.exact.image);
+    this.putExact(pictures);
     this.renderer.present(pictures[0] ?? pictures[1] ?? this.pictureOf("left", left, small, "color"), pictures[1], below, mode, s.divider);
     this.renderer.gl.readPixels(0, 0, 1, 1, this.renderer.gl.RGBA, this.renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits: the time is the true one
     const ms = performance.now() - began;
@@ -178,6 +180,11 @@ export class App {
     if (resting && this.timed[s.layer]?.length === 2) this.rested();
     else if (!resting) this.quality = clamp(quality * (ms > SLOW_MS ? 0.8 : ms < QUICK_MS ? 1.12 : 1), SMALLEST, 0.999);
     this.told(ms, quality);
+  }
+
+  /** Puts exact frames, where there are some of this view, in the place of the page's own pictures. */
+  putExact(pictures) {
+    this.exact?.images.forEach((image, k) => { pictures[k] = this.renderer.photograph(`exact ${k}`, this.exact.key, image); });
   }
 
   /** Changes the state and returns when every scene in use is sorted for it. */
@@ -232,7 +239,7 @@ export class App {
   /** The recorded image of the frame that is nearest in time, as a picture; null until it is decoded. */
   photo() {
     const frame = this.drive.nearestFrame(this.state.camera, this.state.t), image = this.image(frame);
-    return image instanceof ImageBitmap ? this.renderer.photograph(frame.id, image) : null;
+    return image instanceof ImageBitmap ? this.renderer.photograph("recorded", frame.id, image) : null;
   }
 
   /** An address of a recorded image for <img>; null where the page has none. */
@@ -288,9 +295,9 @@ export class App {
   }
 }
 
-/** The same view with fewer pixels. */
+/** The same view with fewer pixels, or with more. */
 export function scaled(view, factor) {
-  if (factor >= 0.999) return view;
+  if (Math.abs(factor - 1) < 0.0015) return view;
   const width = Math.max(8, Math.round(view.width * factor)), height = Math.max(8, Math.round(view.height * factor));
   const sx = width / view.width, sy = height / view.height;
   return { ...view, width, height, fx: view.fx * sx, fy: view.fy * sy, cx: view.cx * sx, cy: view.cy * sy };

@@ -35,6 +35,14 @@ export class Drive {
     return { eye: add(place(p), sub(place(q), place(p)), u), axes: axesOf(rotationOf(slerp(quaternionOf(rotation(p)), quaternionOf(rotation(q)), u))) };
   }
 
+  /** The vehicle's velocity in the world between the recorded poses around a time, m/s. */
+  velocity(t) {
+    const { times, positions } = this.ego;
+    if (times.length < 2) return [0, 0, 0];
+    const found = times.findIndex((one) => one >= t), after = clamp(found < 0 ? times.length : found, 1, times.length - 1);
+    return sub(positions[after], positions[after - 1]).map((v) => v / (times[after] - times[after - 1]));
+  }
+
   /** The vehicle's own left at a time, made horizontal. */
   left(t) {
     const r = this.ego.nearest(t).rotation;

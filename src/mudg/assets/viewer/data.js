@@ -3,7 +3,7 @@
 
 import { PoseKeys } from "mudg/math";
 
-const ARRAYS = { f4: Float32Array, u4: Uint32Array, u2: Uint16Array, u1: Uint8Array };
+const ARRAYS = { f4: Float32Array, u4: Uint32Array, u2: Uint16Array, i2: Int16Array, u1: Uint8Array };
 /** Texels of the data texture per row. */
 export const TEXTURE_WIDTH = 2048;
 
@@ -82,7 +82,8 @@ export function unpacked({ block, block_of: blockOf, position, scale, rotation, 
       words[at + 4] = rotation[row] | (rotation[n + row] << 8) | (rotation[2 * n + row] << 16) | (rotation[3 * n + row] << 24);
       words[at + 5] = half(size[0]) | (half(size[1]) << 16);
       words[at + 6] = half(size[2]) | (color[3 * n + row] << 16);
-      words[at + 7] = color[row] | (color[n + row] << 8) | (color[2 * n + row] << 16) | ((certainty ? certainty[row] : 255) << 24);
+      const green = color[n + row], red = (color[row] + green) & 255, blue = (color[2 * n + row] + green) & 255;
+      words[at + 7] = red | (green << 8) | (blue << 16) | ((certainty ? certainty[row] : 255) << 24);
       for (let k = 0; harmonics && k * n < harmonics.length; k++) words[at + 8 + (k >> 2)] |= harmonics[k * n + row] << (8 * (k & 3));
     }
   }
@@ -92,9 +93,9 @@ export function unpacked({ block, block_of: blockOf, position, scale, rotation, 
 /** A scene as the page keeps it, without its Gaussians: sky, nodes with their poses, how large its texture is. */
 export class SplatScene {
   /**
-   * @param facts the scene's entry in the page's facts. @param sections see `sectionsOf`.
+   * @param facts the scene's entry in the page's facts. @param sections see `sectionsOf`. @param grounds ids of the classes of ground.
    */
-  constructor(facts, sections) {
+  constructor(facts, sections, grounds) {
     this.facts = facts;
     this.rows = facts.rows;
     this.chunkRows = Math.max(1, Math.min(facts.chunk_rows, facts.rows));
@@ -102,6 +103,7 @@ export class SplatScene {
     this.hasCertainty = facts.certainty;
     this.texels = 2 + Math.ceil([0, 3, 6, 12][facts.degree] / 4); // 9, 24 and 45 bytes of harmonics
     this.layerHeight = Math.ceil(this.chunkRows * this.texels / TEXTURE_WIDTH);
+    this.ground = facts.classes.reduce((bits, id, k) => (k < 32 && grounds.includes(id) ? bits | (1 << k) : bits), 0) >>> 0;
     this.nodes = facts.nodes.map((node) => ({ ...node, pose: node.keys
       ? new PoseKeys(sections.keys.subarray(8 * node.keys[0], 8 * (node.keys[0] + node.keys[1]))) : null }));
     this.deform = sections.deform;
@@ -126,7 +128,7 @@ export class SplatScene {
       const grid = new Float32Array(4 * cells);
       for (let axis = 0; axis < 3; axis++) {
         const p = node.grid[0] + (3 * before + axis) * cells, q = node.grid[0] + (3 * after + axis) * cells;
-        for (let c = 0; c < cells; c++) grid[4 * c + axis] = this.deform[p + c] + u * (this.deform[q + c] - this.deform[p + c]);
+        for (let c = 0; c < cells; c++) grid[4 * c + axis] = this.facts.deform_step * (this.deform[p + c] + u * (this.deform[q + c] - this.deform[p + c]));
       }
       rows[at + 13] = base;
       rows.set([...node.size_m, 0], at + 16);

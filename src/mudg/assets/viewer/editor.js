@@ -3,7 +3,7 @@
 
 import { Ground, Motion, SHOWN, carriedOut, scriptText, summary, verbOf, withMove } from "mudg/edits";
 import { PoseKeys } from "mudg/math";
-import { LIGHTS, VISIBILITIES_M, conditionsOf, withConditions } from "mudg/weather";
+import { COVERS, LIGHTS, RAINS_MM_H, SNOWS_MM_H, VISIBILITIES_M, conditionsOf, withConditions } from "mudg/weather";
 
 const WAIT_MS = 350;
 const MOST_STEPS = 200;
@@ -184,9 +184,11 @@ export class Editor {
     by.append(...[...this.own].map((name) => new Option(name, name)));
     $("edit-replace").onclick = () => this.replace(id(), by.value);
     $("edit-insert").onclick = () => this.insert(id());
-    $("fog").max = String(VISIBILITIES_M.length - 1);
-    $("fog").oninput = ({ target }) => { $("fog-text").textContent = visibility(VISIBILITIES_M[target.value]); };
-    $("fog").onchange = ({ target }) => this.conditions({ visibility_m: VISIBILITIES_M[target.value] });
+    for (const [name, [key, values, text]] of Object.entries(SLIDERS)) {
+      $(name).max = String(values.length - 1);
+      $(name).oninput = ({ target }) => { $(`${name}-text`).textContent = text(values[target.value]); };
+      $(name).onchange = ({ target }) => this.conditions({ [key]: values[target.value] });
+    }
     $("light").append(...Object.entries(LIGHTS).map(([value, [name]]) => new Option(name, value)));
     $("light").onchange = ({ target }) => this.conditions({ time: target.value });
     app.listeners.add(() => this.fields());
@@ -194,10 +196,13 @@ export class Editor {
 
   /** Fields of the selected object. */
   fields() {
-    const { visibility_m: seen, time } = conditionsOf(this.app.state.edits);
-    $("fog").value = String(VISIBILITIES_M.findLastIndex((one) => !seen ? one === 0 : one === 0 || one >= seen));
-    $("fog-text").textContent = visibility(seen);
-    $("light").value = time;
+    const now = conditionsOf(this.app.state.edits);
+    for (const [name, [key, values, text]] of Object.entries(SLIDERS)) {
+      const value = now[key], thicker = name === "fog" ? (one) => one >= value : (one) => one <= value;
+      $(name).value = String(value ? values.findLastIndex((one) => one === 0 || thicker(one)) : 0);
+      $(`${name}-text`).textContent = text(value);
+    }
+    $("light").value = now.time;
     const { selected } = this.app.state, shown = selected !== null && this.can(selected);
     $("edit-object").hidden = !shown;
     $("edit-hint").hidden = shown;
@@ -228,7 +233,13 @@ export class Editor {
   }
 }
 
-const visibility = (metres) => (metres ? `visibility ${metres} m` : "none");
+/** Sliders of the weather: condition, its values, how one is said. */
+const SLIDERS = {
+  fog: ["visibility_m", VISIBILITIES_M, (metres) => (metres ? `visibility ${metres} m` : "none")],
+  rain: ["rain_mm_h", RAINS_MM_H, (rate) => (rate ? `${rate} mm/h` : "none")],
+  snow: ["snow_mm_h", SNOWS_MM_H, (rate) => (rate ? `${rate} mm/h of water` : "none")],
+  cover: ["cover", COVERS, (share) => (share ? `${Math.round(100 * share)} % white` : "none")],
+};
 
 /** A path as the server says it. */
 function told({ rows, source }, recorded) {

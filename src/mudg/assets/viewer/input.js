@@ -77,7 +77,10 @@ function hover(app, event) {
 function click(app, event) {
   const frame = frameUnder(app, event), { view } = app.last;
   if (!frame) app.change({ selected: view ? objectAt(view, ...placeOf(app, event), app.tracks, app.state.t) : null });
-  else app.change({ mode: "recorded", camera: frame.camera, t: frame.t, shift: 0, up: 0 });
+  else {
+    document.getElementById("thumb").hidden = true;
+    app.change({ mode: "recorded", camera: frame.camera, t: frame.t, shift: 0, up: 0 });
+  }
 }
 
 const NUDGES = { ArrowUp: { along_m: 0.1 }, ArrowDown: { along_m: -0.1 }, ArrowLeft: { left_m: 0.1 }, ArrowRight: { left_m: -0.1 }, "<": { yaw_deg: 1 }, ">": { yaw_deg: -1 } };

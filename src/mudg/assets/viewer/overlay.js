@@ -1,6 +1,6 @@
 // Boxes, paths, LiDAR points and recorded cameras, drawn over the picture. They are not hidden by what stands before them.
 
-import { add, project, turn } from "mudg/math";
+import { add, dot, project, sub, turn } from "mudg/math";
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const NEAREST = 0.25;
@@ -11,6 +11,14 @@ export function trackColor(id) {
   let hash = 0;
   for (const letter of id) hash = (hash * 31 + letter.codePointAt(0)) >>> 0;
   return `hsl(${hash % 360} 85% 62%)`;
+}
+
+/** The part of a stretch in the world that lies before the camera, as two places in the picture; null where nothing does. */
+export function ahead(view, p, q) {
+  const z = (place) => dot(view.axes[2], sub(place, view.eye)), [a, b] = [z(p) - NEAREST, z(q) - NEAREST];
+  if (a < 0 && b < 0) return null;
+  const cut = () => add(p, sub(q, p), a / (a - b));
+  return [a < 0 ? cut() : p, b < 0 ? cut() : q].map((place) => project(view, place));
 }
 
 export class Overlay {
@@ -56,12 +64,14 @@ export class Overlay {
     c.lineWidth = width * this.ratio;
     c.setLineDash(dash.map((v) => v * this.ratio));
     c.beginPath();
-    let down = false;
-    for (const point of points) {
-      const [x, y, z] = project(view, point);
-      if (z < NEAREST) { down = false; continue; }
-      if (down) c.lineTo(x, y); else c.moveTo(x, y);
-      down = true;
+    let last = null;
+    for (let i = 1; i < points.length; i++) {
+      const part = ahead(view, points[i - 1], points[i]);
+      if (!part) continue;
+      const [[x0, y0], [x1, y1]] = part;
+      if (!last || last[0] !== x0 || last[1] !== y0) c.moveTo(x0, y0);
+      c.lineTo(x1, y1);
+      last = [x1, y1];
     }
     c.stroke();
     c.setLineDash([]);
@@ -78,17 +88,21 @@ export class Overlay {
     const pose = track.pose.at(t);
     if (!pose) return;
     const half = track.size_m.map((v) => v / 2), c = this.context, color = trackColor(track.id);
-    const corners = Array.from({ length: 8 }, (_, k) => project(view, add(pose.position,
-      turn(pose.rotation, [(k & 4 ? 1 : -1) * half[0], (k & 2 ? 1 : -1) * half[1], (k & 1 ? 1 : -1) * half[2]]))));
-    if (corners.some((corner) => corner[2] < NEAREST)) return;
+    const places = Array.from({ length: 8 }, (_, k) => add(pose.position,
+      turn(pose.rotation, [(k & 4 ? 1 : -1) * half[0], (k & 2 ? 1 : -1) * half[1], (k & 1 ? 1 : -1) * half[2]])));
+    const corners = places.map((place) => project(view, place)).filter(([, , z]) => z >= NEAREST);
+    if (!corners.length) return;
     c.strokeStyle = color;
     c.lineWidth = (chosen ? 3 : 1.5) * this.ratio;
     c.beginPath();
-    for (const [a, b] of EDGES) { c.moveTo(corners[a][0], corners[a][1]); c.lineTo(corners[b][0], corners[b][1]); }
+    for (const [a, b] of EDGES) {
+      const edge = ahead(view, places[a], places[b]);
+      if (edge) { c.moveTo(edge[0][0], edge[0][1]); c.lineTo(edge[1][0], edge[1][1]); }
+    }
     c.stroke();
     c.fillStyle = color.replace(")", " / .22)"); // the front face
     c.beginPath();
-    for (const k of [4, 5, 7, 6]) c.lineTo(corners[k][0], corners[k][1]);
+    [4, 5, 7, 6].forEach((k, i, face) => ahead(view, places[k], places[face[(i + 1) % 4]])?.forEach(([x, y]) => c.lineTo(x, y)));
     c.fill();
     if (!chosen && corners[0][2] > LABELS_WITHIN_M) return;
     const top = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best));
@@ -98,6 +112,8 @@ export class Overlay {
     c.fillStyle = "rgb(12 14 18 / .78)";
     c.fillRect(top[0] - wide / 2 - 4 * this.ratio, top[1] - 19 * this.ratio, wide + 8 * this.ratio, 16 * this.ratio);
     c.fillStyle = color;
+    c.fillRect(top[0] - wide / 2 - 7 * this.ratio, top[1] - 19 * this.ratio, 3 * this.ratio, 16 * this.ratio);
+    c.fillStyle = "#f2f4f8"; // some colours of boxes are hard to read
     c.fillText(text, top[0] - wide / 2, top[1] - 7 * this.ratio);
   }
 

@@ -4,7 +4,8 @@
 import { TEXTURE_WIDTH } from "mudg/data";
 import * as shaders from "mudg/shaders";
 import { Sorter } from "mudg/sorter";
-import { preview } from "mudg/weather";
+import { streaks } from "mudg/particles";
+import { conditionsOf, fallingOf, preview } from "mudg/weather";
 
 /** Camera z below which nothing is drawn, metres; as everywhere in the program. */
 export const NEAR_M = 0.2;
@@ -44,8 +45,21 @@ export class Renderer {
     this.nodes = gl.createTexture();
     this.grids = gl.createTexture();
     this.empty = gl.createVertexArray();
-    this.photo = { key: null, texture: null };
-    this.conditions = { visibility_m: 0, time: "as_recorded" };
+    this.photos = new Map(); // place -> {key, texture}
+    this.conditions = conditionsOf([]);
+    this.velocity = () => [0, 0, 0]; // of the vehicle at a time, m/s; it tilts the streaks of drops
+    this.drops = this.program(shaders.dropVertex, shaders.dropFragment);
+    this.dropRows = gl.createBuffer();
+    this.dropArray = gl.createVertexArray();
+    gl.bindVertexArray(this.dropArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.dropRows);
+    for (const [name, count, offset] of [["ends", 4, 0], ["about", 3, 16]]) {
+      const at = gl.getAttribLocation(this.drops.program, name);
+      gl.enableVertexAttribArray(at);
+      gl.vertexAttribPointer(at, count, gl.FLOAT, false, 28, offset);
+      gl.vertexAttribDivisor(at, 1);
+    }
+    gl.bindVertexArray(null);
   }
 
   // ---- resources ----
@@ -207,7 +221,11 @@ export class Renderer {
     gl.uniform2f(places.colorRange, loaded.scene.facts.color_low, loaded.scene.facts.color_high);
     gl.uniform1f(places.harmonicStep, loaded.scene.facts.harmonic_step ?? 0);
     gl.uniform1i(places.turning, loaded.scene.facts.harmonics_in_world ? 0 : 1); // colours turn with their object
-    gl.uniform4fv(places.fog, preview(this.conditions, loaded.scene.sky).fog);
+    const { fog, veil, snow } = preview(this.conditions, loaded.scene.sky);
+    gl.uniform4fv(places.fog, fog);
+    gl.uniform4fv(places.veil, veil);
+    gl.uniform4fv(places.snow, snow);
+    gl.uniform1ui(places.ground, loaded.scene.ground);
     gl.uniform1f(places.nearest, NEAR_M);
     gl.uniform1i(places.layer, layer);
     gl.uniform1i(places.antialias, loaded.scene.facts.antialias ? 1 : 0);
@@ -253,11 +271,36 @@ export class Renderer {
       gl.uniform2f(places.depthRange, ...this.facts.depth_range_m);
       gl.uniform3fv(places.gain, view.gain);
       gl.uniform3fv(places.offset, view.offset);
-      const { fog, light } = preview(this.conditions, loaded.scene.sky);
+      const { fog, light, veil } = preview(this.conditions, loaded.scene.sky);
       gl.uniform4fv(places.fog, fog);
+      gl.uniform4fv(places.veil, veil);
       gl.uniform4fv(places.light, light);
     });
+    if (layer === "color") this.rain(loaded, view, t, placed, picture);
     return picture;
+  }
+
+  /** Draws the drops and flakes that are nearer than the surfaces, one by one. */
+  rain(loaded, view, t, placed, picture) {
+    const gl = this.gl, kinds = fallingOf(this.conditions, this.facts.particle_keys), air = preview(this.conditions, loaded.scene.sky);
+    if (!kinds.length) return;
+    const rows = new Float32Array(kinds.flatMap((kind) => streaks(kind, view, t + this.facts.begin_s, this.velocity(t))));
+    const depths = this.target("depths", view.width, view.height, this.sumFormat), { program, places } = this.drops;
+    this.blend(loaded, loaded.programs.sums, depths, view, placed, layerNumber("depth"));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, picture.frame);
+    gl.viewport(0, 0, view.width, view.height);
+    gl.useProgram(program);
+    this.bind(0, depths.textures[0]);
+    gl.uniform1i(places.depths, 0);
+    gl.uniform2f(places.size, view.width, view.height);
+    gl.uniform3fv(places.color, air.fog.slice(0, 3).map((v, k) => v * air.light[k]));
+    gl.bindVertexArray(this.dropArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.dropRows);
+    gl.bufferData(gl.ARRAY_BUFFER, rows, gl.DYNAMIC_DRAW);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, rows.length / 7);
+    gl.disable(gl.BLEND);
   }
 
   classes(loaded, view, placed, picture, plain) {
@@ -283,18 +326,18 @@ export class Renderer {
     return picture;
   }
 
-  /** A photograph, or an exact frame, as a picture; kept until another one comes. */
-  photograph(key, image) {
-    if (this.photo.key !== key) {
+  /** A photograph, or an exact frame, as a picture; kept until another one comes to its place. */
+  photograph(place, key, image) {
+    if (this.photos.get(place)?.key !== key) {
       const gl = this.gl;
-      if (this.photo.texture) gl.deleteTexture(this.photo.texture);
+      if (this.photos.has(place)) gl.deleteTexture(this.photos.get(place).texture);
       const made = gl.createTexture();
       gl.bindTexture(gl.TEXTURE_2D, made);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
       this.filtered(gl.LINEAR);
-      this.photo = { key, texture: made };
+      this.photos.set(place, { key, texture: made });
     }
-    return { textures: [this.photo.texture], image: true };
+    return { textures: [this.photos.get(place).texture], image: true };
   }
 
   /**

@@ -14,7 +14,7 @@ precision highp float; precision highp int; precision highp usampler2DArray; pre
 export const splatVertex = (degree, texels, width, rows) => HEAD + `
 uniform usampler2DArray data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
-uniform vec2 colorRange; uniform vec4 fog; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
+uniform vec2 colorRange; uniform vec4 fog, veil, snow; uniform uint ground; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -107,7 +107,10 @@ void main() {
     uvec3 levels = uvec3(second.w, second.w >> 8, second.w >> 16) & 255u;
     payload.rgb = mix(vec3(colorRange.x), vec3(colorRange.y), vec3(levels) / 255.0);
     ${degree ? "payload.rgb += harmonics(normalize(turning ? fromEye * worldFromNode : fromEye));" : ""}
-    payload.rgb = mix(fog.rgb, max(payload.rgb, 0.0), exp(-fog.a * length(fromEye))); // a preview
+    payload.rgb = max(payload.rgb, 0.0); // what follows is a preview
+    if (vote.x < 32u && ((ground >> vote.x) & 1u) == 1u) payload.rgb = mix(payload.rgb, snow.rgb, snow.a);
+    float way = length(fromEye), thin = fog.a * way + veil.x * max(way - veil.y, 0.0) + veil.z * max(way - veil.w, 0.0);
+    payload.rgb = mix(fog.rgb, payload.rgb, exp(-thin));
   } else if (layer == 1) payload.rgb = vec3(c.z);
   else if (layer == 3) payload.rgb = tint(node);
   else if (layer == 4) { // the shortest axis, towards the camera
@@ -141,7 +144,7 @@ void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2
 /** Sums of one layer to a picture: sky behind colours, depth and confidence through their colour scales. */
 export const resolveFragment = HEAD + `
 uniform sampler2D sums, sky, scales; uniform int layer; uniform bool hasSky;
-uniform mat3 worldFromCamera; uniform vec4 intrinsics; uniform vec2 size, depthRange; uniform vec3 gain, offset; uniform vec4 fog, light;
+uniform mat3 worldFromCamera; uniform vec4 intrinsics; uniform vec2 size, depthRange; uniform vec3 gain, offset; uniform vec4 fog, light, veil;
 out vec4 color;
 void main() {
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
@@ -152,7 +155,8 @@ void main() {
       vec3 ray = worldFromCamera * vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0);
       vec2 at = vec2(atan(ray.y, ray.x) / 6.2831853 + 0.5, 0.5 - atan(ray.z, length(ray.xy)) / 3.14159265);
       vec3 behind = texture(sky, at).rgb;
-      if (fog.a > 0.0) behind = mix(fog.rgb, behind, exp(-fog.a * 300.0 / max(ray.z / length(ray), 0.01))); // fog is 300 m high
+      float thin = 300.0 * fog.a + 1000.0 * (veil.x + veil.z); // fog is 300 m high, clouds are 1000 m up
+      behind = mix(fog.rgb, behind, exp(-thin / max(ray.z / length(ray), 0.01)));
       rgb += (1.0 - sum.a) * behind;
     }
     rgb = gain * rgb + offset;
@@ -168,6 +172,26 @@ void main() {
     rgb = mix(vec3(0.55, 0.12, 0.10), sure, smoothstep(0.02, 0.18, c)) * (0.35 + 0.65 * sum.a);
   }
   color = vec4(clamp(rgb, 0.0, 1.0), 1.0);
+}`;
+
+/** Streaks of drops and flakes: rectangles between two ends, as wide as they are and at least a pixel. */
+export const dropVertex = HEAD + `
+uniform vec2 size; in vec4 ends; in vec3 about; // width in pixels, camera z, how much of a pixel is covered in all
+flat out float z, thin;
+void main() {
+  vec2 way = ends.zw - ends.xy; float far = length(way), half_ = 0.5 * max(about.x, 1.0);
+  vec2 along = far > 1e-4 ? way / far : vec2(1.0, 0.0);
+  vec2 at = mix(ends.xy - half_ * along, ends.zw + half_ * along, float(gl_VertexID >> 1)) + half_ * float((gl_VertexID & 1) * 2 - 1) * vec2(-along.y, along.x);
+  z = about.y; thin = about.z / (2.0 * half_ * (far + 2.0 * half_));
+  gl_Position = vec4(at / size * vec2(2.0, -2.0) + vec2(-1.0, 1.0), 0.0, 1.0);
+}`;
+
+export const dropFragment = HEAD + `
+uniform sampler2D depths; uniform vec3 color; flat in float z, thin; out vec4 drawn;
+void main() {
+  vec4 sum = texelFetch(depths, ivec2(gl_FragCoord.xy), 0);
+  if (sum.a >= 0.5 && z > sum.r / sum.a) discard;
+  drawn = vec4(color, 1.0 - exp(-thin));
 }`;
 
 /** Votes to the class with most of them; 'colors' false: its number / 255 instead of its colour. */

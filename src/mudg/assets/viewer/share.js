@@ -6,9 +6,10 @@ import { toHash } from "mudg/state";
 import { zipOf } from "mudg/zip";
 
 const MOST_SIDE = 8192;
-const FRAMES_PER_S = 10;
+/** Of videos and of the pictures of a drive. */
+export const FRAMES_PER_S = 10;
 
-function save(blob, name) {
+export function save(blob, name) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
   link.download = name;
@@ -16,15 +17,16 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
+export const nameOf = (app, end) => `${app.facts.title.replace(/[^\w.-]+/g, "_")}_${app.state.layer}_${app.state.t.toFixed(2)}s.${end}`;
 
 /** What is shown, `times` as large, on a canvas of its own; boxes and points are drawn on it as on the page. */
 function sheetOf(app, times) {
   const { canvas, overlay, renderer, state } = app, whole = app.last.view, factor = Math.min(times, MOST_SIDE / Math.max(whole.width, whole.height));
   const before = [canvas.width, canvas.height], view = scaled(whole, factor), { left, right, mode } = app.used();
   Object.assign(canvas, { width: view.width, height: view.height });
-  renderer.present(app.pictureOf("left", left, view) ?? app.pictureOf("left", left, view, "color"),
-    right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null, [0, 0, view.width, view.height], mode, state.divider);
+  const pictures = [app.pictureOf("left", left, view) ?? app.pictureOf("left", left, view, "color"), right === "recorded" ? app.photo() : right ? app.pictureOf("right", right, view) : null];
+  if (view === whole) app.putExact(pictures);
+  renderer.present(...pictures, [0, 0, view.width, view.height], mode, state.divider);
   const sheet = Object.assign(document.createElement("canvas"), { width: view.width, height: view.height }), c = sheet.getContext("2d");
   c.drawImage(canvas, 0, 0);
   if (overlay.style.visibility !== "hidden") c.drawImage(overlay, ...app.last.area, 0, 0, view.width, view.height);
@@ -42,11 +44,14 @@ export async function savePicture(app, times) {
   return blob.size;
 }
 
+/** How many pictures a drive has. */
+export const framesOf = (app) => Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1;
+
 /** Saves the whole drive as pictures in an archive: each is drawn in full, however long that takes. Asked for once more, it ends early. */
 export async function saveFrames(app, say) {
   if (app.saving) { app.saving = false; return; }
   app.saving = true;
-  const { t, playing } = app.state, count = Math.floor(app.facts.end_s * FRAMES_PER_S + 1e-6) + 1, files = [];
+  const { t, playing } = app.state, count = framesOf(app), files = [];
   try {
     for (let k = 0; k < count && app.saving; k++) {
       say(`Frame ${k + 1} of ${count}. Frames ends it.`);

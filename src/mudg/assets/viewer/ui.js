@@ -4,6 +4,7 @@ import { MODES } from "mudg/cameras";
 import { LAYERS } from "mudg/shaders";
 import { clamp, project } from "mudg/math";
 import { trackColor } from "mudg/overlay";
+import { exactVideos } from "mudg/exact";
 import { recordVideo, saveEdits, saveFrames, saveLink, savePicture } from "mudg/share";
 
 const LAYER_NAMES = { color: "Color", depth: "Depth", class: "Classes", instance: "Objects", normal: "Normals", confidence: "Confidence", recorded: "Recorded" };
@@ -198,6 +199,7 @@ export class Controls {
     $("picture").onclick = () => savePicture(app, Number($("times").value));
     $("video").onclick = () => recordVideo(app, (text) => this.say(text));
     $("frames").onclick = () => saveFrames(app, (text) => this.say(text));
+    exactVideos(app, (text) => this.say(text));
     $("link").onclick = async () => this.say(await saveLink(app));
     $("help").onclick = () => $("keys").showModal();
     $("open").onclick = () => { const shown = document.body.classList.toggle("with-panel"); $("open").setAttribute("aria-expanded", String(shown)); app.change(); };

@@ -138,7 +138,7 @@ def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: Wea
     falling = FogSettings(top_m=1000.0)  # below the clouds
     path = fog.optical_depth(distance, rise, height, falling) / fog.extinction(falling.visibility_m)
     for fall, extinction in ((weather.rain, particles.rain_extinction), (weather.snow, particles.snow_extinction)):
-        if fall is not None:
+        if fall is not None and fall.mm_h > 0:  # level rays have no end
             share = share * np.exp(-extinction(fall.mm_h) * np.maximum(path - fall.reach_m, 0))
     return fog.veiled(gbuffer.color, share, light.airlight), share.astype(np.float32)
 

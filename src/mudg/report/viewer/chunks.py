@@ -3,7 +3,8 @@
 The Gaussians are ranked by what they cover in the recorded views. Chunk 0 holds the first `CHUNK` of them, from everywhere in the scene,
 the two chunks after it the next 2 `CHUNK`, then 4, 8, ...: one level of detail after another, each as large as all before it and one
 chunk more. Within a level the rows are ordered by node, within a node along a Morton curve, and cut into chunks: each is a region,
-and a page fetches those near its camera first. Every chunk is full except for the last.
+and a page fetches those near its camera first. Every chunk is full except for the last. A scene of at most `SMALL` chunks is cut into
+halves of chunks, because its first picture, of one chunk, comes sooner that way.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from mudg.base.errors import UsageError
 
 CHUNK: Final = 65_536
 """Gaussians per chunk."""
+SMALL: Final = 2
+"""Chunks of a scene whose chunks are half as large."""
 MOST_CHUNKS: Final = 256
 """A chunk is a layer of a texture array; WebGL2 promises this many."""
 ALPHA_MIN: Final = 1 / 255
@@ -65,7 +68,8 @@ def lay_out(
 
     Args:
         columns: of the scene's table. node: of each row.
-        path: positions of the cameras f64[m, 3]. most: rows to keep (0 = all that can be drawn). size: rows per chunk.
+        path: positions of the cameras f64[m, 3]. most: rows to keep (0 = all that can be drawn). size: rows per chunk
+            of a scene that is not small.
 
     Raises:
         UsageError: more rows than a page can hold.
@@ -80,10 +84,15 @@ def lay_out(
     if len(ranks) > MOST_CHUNKS * size:
         raise UsageError("more Gaussians than a page can hold", where="--budget", got=f"{len(ranks):,}",
                          expected=f"at most {MOST_CHUNKS * size:,}", remedy="set --budget to keep those that cover most")  # fmt: skip
-    rows = rows[ranks]
+    rows, size = rows[ranks], chunk_rows(len(ranks), size)
     level = np.repeat([np.int8(level_of(k)) for k in range(-(-len(rows) // size))], size)[: len(rows)]
     order = np.lexsort((morton_codes(columns["means"], node, rows), node[rows], level))
     return Layout(rows[order], size, len(node), visible, lost)
+
+
+def chunk_rows(rows: int, size: int = CHUNK) -> int:
+    """Rows per chunk of a scene with so many: half of ``size`` in a small scene."""
+    return max(1, size // 2) if rows <= SMALL * size else size
 
 
 def opacity_of(logits: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """What the viewer page knows about a log besides Gaussians: cameras, frames with small images, boxes, the vehicle's path, LiDAR points.
 
 Times on the page are seconds since the first frame. Sections of the log's blob (see ``packed.py``): ``keys`` f32[k, 8] and ``lidar``
-u16[m, 3], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see ``with_ground``).
+u16[3, m], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see ``with_ground``).
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mudg.base import palette
+from mudg.base import palette, seeds
 from mudg.base.camera_colors import CameraColors
 from mudg.base.types import Camera, Frame, Scene
 from mudg.core.ground import HeightMap
 from mudg.core.pictures import depth_colors, resize_area
+from mudg.core.weather.particles import FLAKE_EDGES_MM, RAIN_EDGES_MM
 from mudg.data.scene import read_image, read_points
 from mudg.report.page import FAR_M, NEAR_M
 from mudg.report.viewer.packed import Sections, key_rows
@@ -27,6 +28,8 @@ from mudg.report.viewer.packed import Sections, key_rows
 WEBP_QUALITY: Final = 50
 REACH_M: Final = 80.0
 MOST_CELLS: Final = 4_000_000
+LEAST_STEP_M: Final = 5e-4
+"""Of heights of the ground; ten times that of LiDAR points."""
 UNKNOWN: Final = 65535
 """Level of the ground where its height is not known."""
 
@@ -85,15 +88,25 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
 def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
     """The page with heights of the ground, for objects that are moved on it; without them where they are not known or too many.
 
-    Section ``ground``: world z as ``low + value * step``, less than 1 mm apart within 65 m; `UNKNOWN` where it is not known.
+    Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span more than 33 m; `UNKNOWN`
+    where it is not known.
     """
     if ground is None or ground.heights.size > MOST_CELLS or not np.isfinite(ground.heights).any() or min(ground.heights.shape) < 2:
         return replace(page, facts=page.facts | {"ground": None})
     low, high = float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights))
-    step = max((high - low) / (UNKNOWN - 1), 1e-6)
+    step = max((high - low) / (UNKNOWN - 1), LEAST_STEP_M)
     levels = np.where(np.isfinite(ground.heights), np.rint((ground.heights - low) / step), UNKNOWN).astype(np.uint16)
     record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape), "low": low, "step": step}
     return replace(page, facts=page.facts | {"ground": record}, sections=page.sections | {"ground": levels})
+
+
+def with_particles(page: PageFacts, seed: int) -> PageFacts:
+    """The page with the keys of random drops and flakes, so that it draws those of a render with this seed."""
+    keys = {
+        name: [seeds.key(seed, index, purpose) & 0x7FFFFFFF for index in range(len(edges) - 1)]
+        for name, purpose, edges in (("rain", "rain", RAIN_EDGES_MM), ("snow", "flakes", FLAKE_EDGES_MM))
+    }
+    return replace(page, facts=page.facts | {"particle_keys": keys})
 
 
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
@@ -140,6 +153,6 @@ def _lidar(scene: Scene, begin: float, most: int) -> tuple[dict[str, Any], NDArr
         first += len(xyz)
     points = np.concatenate(clouds)
     low = points.min(0) if len(points) else np.zeros(3)
-    step = np.maximum(points.max(0) - low if len(points) else np.ones(3), 1e-3) / 65535
-    levels = np.rint((points - low) / step).astype(np.uint16)
+    step = np.maximum((points.max(0) - low if len(points) else np.ones(3)) / 65535, 10 * LEAST_STEP_M)
+    levels = np.ascontiguousarray(np.rint((points - low) / step).astype(np.uint16).T)
     return {"lidar": records, "lidar_low": low.tolist(), "lidar_step": step.tolist()}, levels

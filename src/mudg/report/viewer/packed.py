@@ -9,7 +9,8 @@
     scale     u8[3, n]     least + value * step, natural logarithm of metres
     rotation  u8[4, n]     bytes of a u32: the three smaller parts of the unit quaternion (w x y z) as 10 bits each, offset 512, and in
                            the highest two bits which part is left out; it is positive
-    color     u8[4, n]     r g b of the constant band, between ``color_low`` and ``color_high``; opacity of 255
+    color     u8[4, n]     r - g, g, b - g of the constant band (modulo 256: most surfaces are nearly grey, so this compresses better);
+                           r g b are between ``color_low`` and ``color_high``; then opacity of 255
     class     u8[2, n]     channel of the likeliest class (255: none), and its lead over the second in `LEAD_STEP`
     certainty u8[n]        of 255 (only if it was measured)
     harmonics u8[3 (K - 1), n]   further bands, (value - 128) * ``harmonic_step`` (only above degree 0)
@@ -45,6 +46,8 @@ LEAD_STEP: Final = 0.1
 PLACE_STEP_M: Final = 0.0005
 SCALE_STEP: Final = 0.01
 """Finest steps of places, metres, and of logarithms of scales."""
+DEFORM_STEP_M: Final = 1e-4
+"""Of displacements of what deforms; beyond 3.2 m they are cut."""
 SAMPLE: Final = 100_000
 SH_BAND_0: Final = 0.28209479177387814
 COLOR_LIMITS: Final = (-0.5, 2.0)
@@ -113,7 +116,7 @@ def pack_scene(
     facts: dict[str, Any] = {
         "rows": len(layout.rows), "chunk_rows": layout.size, "degree": model.sh_degree, "classes": list(model.classes),
         "lead_step": LEAD_STEP, "color_low": low, "color_high": high, "certainty": model.certainty is not None,
-        "antialias": bool(_drawing(model).get("antialias", False)), "nodes": nodes,
+        "antialias": bool(_drawing(model).get("antialias", False)), "nodes": nodes, "deform_step": DEFORM_STEP_M,
     }  # fmt: skip
     if model.sh_degree:
         facts |= {
@@ -201,8 +204,8 @@ def _color_range(bands: Any, layout: Layout, degree: int) -> tuple[float, float]
 
 
 def _colors(columns: Mapping[str, Any], rows: Any, low: float, high: float) -> NDArray[np.uint8]:
-    rgb = columns["sh_dc"][rows, 0] * SH_BAND_0 + 0.5
-    return np.concatenate([to_u8((rgb - low) / (high - low)).T, to_u8(opacity_of(columns["logits"][rows]))[None]])
+    red, green, blue = to_u8((columns["sh_dc"][rows, 0] * SH_BAND_0 + 0.5 - low) / (high - low)).T
+    return np.stack([red - green, green, blue - green, to_u8(opacity_of(columns["logits"][rows]))])
 
 
 def _classes(logits: Any, rows: Any) -> NDArray[np.uint8]:
@@ -238,9 +241,9 @@ def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, A
     Returns:
         One record per node (name, kind, label, size_m, ``keys``: first row and number of its keys in section "keys", ``grid``: first
         value and cells of its displacements in "deform"), and the sections: ``keys`` f32[k, 8] (time since ``begin_s``, position,
-        quaternion w x y z, world from box), ``deform`` f32[...] as [key, xyz, z, y, x] per deformable node, metres.
+        quaternion w x y z, world from box), ``deform`` i16[...] as [key, xyz, z, y, x] per deformable node, in `DEFORM_STEP_M`.
     """
-    records, keys, grids = [], [np.zeros((0, 8), np.float32)], [np.zeros(0, np.float32)]
+    records, keys, grids = [], [np.zeros((0, 8), np.float32)], [np.zeros(0, np.int16)]
     for node in model.nodes:
         record: dict[str, Any] = {"name": node.name, "kind": node.kind}
         if isinstance(node, RigidNode):
@@ -250,7 +253,7 @@ def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, A
             if isinstance(node, DeformableNode):
                 grid = node.offsets["deform"].detach().float().numpy()
                 record["grid"] = [sum(map(len, grids)), list(grid.shape)]
-                grids.append(grid.reshape(-1))
+                grids.append(np.clip(np.rint(grid.reshape(-1) / DEFORM_STEP_M), -32767, 32767).astype(np.int16))
         records.append(record)
     return records, {"keys": np.concatenate(keys), "deform": np.concatenate(grids)}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import bisect
 import gzip
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from markupsafe import Markup
 
 from mudg.base import store
 from mudg.report import html
+from mudg.report.viewer.chunks import chunk_rows
 from mudg.report.viewer.facts import PageFacts
 from mudg.report.viewer.packed import Packed, Sections, blob_of
 
@@ -24,8 +26,8 @@ TEXELS: Final = (2, 3, 4, 5)
 SORT_BYTES: Final = 38
 """Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 MODULES: Final = (
-    "math", "data", "sorter", "shaders", "edits", "weather", "renderer", "cameras", "state", "overlay", "arrival", "app", "zip", "share",
-    "gizmo", "editor", "ui", "input", "exact", "main",
+    "math", "data", "sorter", "shaders", "edits", "particles", "weather", "renderer", "cameras", "state", "overlay", "arrival", "app",
+    "zip", "share", "gizmo", "editor", "ui", "input", "exact", "main",
 )  # fmt: skip
 
 
@@ -101,13 +103,11 @@ class ViewerPage:
 
     def graphics_bytes(self) -> int:
         """What the scenes take on the graphics card: texels of 16 bytes, and the order, 4 bytes per Gaussian."""
-        return sum(
-            16 * TEXELS[p.facts["degree"]] * len(p.layout) * min(p.layout.size, p.kept) + 4 * p.kept for _, p in self.scenes
-        )  # fmt: skip
+        return sum(scene_bytes(p.kept, p.layout.size, p.facts["degree"])[0] for _, p in self.scenes)
 
     def heap_bytes(self) -> int:
         """What a browser keeps of the scenes to sort them: places, nodes, keys and rows twice, two orders."""
-        return sum(SORT_BYTES * packed.kept for _, packed in self.scenes)
+        return sum(scene_bytes(p.kept, p.layout.size, p.facts["degree"])[1] for _, p in self.scenes)
 
     def one_file(self, files: Iterable[PageFile], facts: Mapping[str, Any]) -> bytes:
         """The page with all data in it."""
@@ -123,9 +123,21 @@ class ViewerPage:
             css=Markup(asset("viewer.css")), import_map=Markup(imports), policy=policy(imports, entry),  # noqa: S704
             size=f"{size / 1e6:.1f} MB", near=f"{near:g}", far=f"{far:g}", class_legend=html.class_legend(),
             notes=[note for _, packed in self.scenes for note in packed.notes],
-            payloads=inside, facts=Markup(script_json(facts)), entry=Markup(entry),  # noqa: S704
+            payloads=inside, live=self.live is not None, facts=Markup(script_json(facts)), entry=Markup(entry),  # noqa: S704
         )  # fmt: skip
         return text.encode()
+
+
+def scene_bytes(rows: int, size: int, degree: int) -> tuple[int, int]:
+    """What a scene of so many rows takes on the graphics card, and to be sorted; ``size``: rows per chunk."""
+    layers = -(-rows // size)
+    return 16 * TEXELS[degree] * layers * min(size, rows) + 4 * rows, SORT_BYTES * rows
+
+
+def most_within(limit_bytes: float, degree: int, size: int) -> int:
+    """The most rows whose graphics memory and memory for sorting are together within a limit."""
+    most = int(limit_bytes // (16 * TEXELS[degree] + 4 + SORT_BYTES))
+    return bisect.bisect_right(range(most + 1), limit_bytes, key=lambda n: sum(scene_bytes(n, chunk_rows(n, size), degree))) - 1
 
 
 def asset(name: str) -> str:

@@ -18,6 +18,9 @@ class PageConfig:
     budget: int = Field(default=3_000_000, ge=0)
     """Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and
     faintest are left out."""
+    memory_mb: int = Field(default=0, ge=0)
+    """Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit).
+    Gaussians are left out as for the budget."""
     image_width_px: int = Field(default=320, ge=0)
     """Width of recorded images on the page, pixels (0 = none)."""
     images: int = Field(default=150, ge=0)

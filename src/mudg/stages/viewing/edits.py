@@ -154,14 +154,9 @@ class EditDesk:
 
 def _unseen(drive: EditedDrive) -> list[str]:
     """What exact frames do not show of a script."""
-    said = []
-    if drive.plan.conditions:
-        said.append(f"{', '.join(drive.plan.conditions)}: mudg render shows it, this page at most a preview of fog and light")
-    if drive.plan.moves_ego:
-        said.append(
-            "the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"
-        )
-    return said
+    if not drive.plan.moves_ego:
+        return []
+    return ["the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"]
 
 
 def desk_for(

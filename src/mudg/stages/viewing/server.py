@@ -8,7 +8,7 @@ import os
 import secrets
 import webbrowser
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
@@ -22,6 +22,8 @@ MOST_BYTES: Final = 8 * 2**20
 COOKIE: Final = "mudg_token"
 Answer = Callable[[Any], tuple[bytes, str]]
 """From a JSON value to content and its type."""
+Stream = Callable[[Any, Callable[[bytes], None]], None]
+"""From a JSON value to content that is sent piece by piece while it is made. Sending raises OSError when nobody listens any more."""
 TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-stream"}
 
 
@@ -31,12 +33,13 @@ class Site:
 
     Args:
         files: name -> content; "" is the page. answers: name -> what answers a POST with JSON there: bytes and their type.
-        token: secret that every request must bring, in the address, a cookie or a header.
+        streams: the same for answers that take long. token: secret that every request must bring, in the address, a cookie or a header.
     """
 
     files: Mapping[str, bytes]
     answers: Mapping[str, Answer]
     token: str
+    streams: Mapping[str, Stream] = field(default_factory=dict)
 
 
 def token_for(host: str, token: str) -> str:
@@ -120,32 +123,52 @@ class SiteRequest(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """JSON to one of the site's answers."""
         parts = urlsplit(self.path)
-        answer = self.site.answers.get(parts.path.removeprefix("/"))
+        name = parts.path.removeprefix("/")
+        answer, stream = self.site.answers.get(name), self.site.streams.get(name)
         origin = self.headers.get("Origin")
         if self._refused(parse_qs(parts.query)):
             return
         if origin is None or urlsplit(origin).netloc != self.headers.get("Host"):
             self._answer(HTTPStatus.FORBIDDEN, b"a request from another page")
-        elif answer is None:
+        elif answer is None and stream is None:
             self._answer(HTTPStatus.NOT_FOUND, b"no such question")
         elif self.headers.get_content_type() != "application/json":
             self._answer(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, b"expected JSON")
         else:
-            self._answer_json(answer)
+            self._answer_json(answer, stream)
 
-    def _answer_json(self, answer: Callable[[Any], tuple[bytes, str]]) -> None:
+    def _answer_json(self, answer: Answer | None, stream: Stream | None) -> None:
         length = self.headers.get("Content-Length", "")
         if not length.isdecimal() or int(length) > MOST_BYTES:
             self._answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"the request is too large")
             return
+        sent: list[int] = []
         try:
-            content, kind = answer(store.parse_json(self.rfile.read(int(length)), "request"))
-        except InputError as error:
-            self._answer(HTTPStatus.BAD_REQUEST, str(error).encode())
+            asked = store.parse_json(self.rfile.read(int(length)), "request")
+            if answer is not None:
+                self._answer(HTTPStatus.OK, *answer(asked))
+            elif stream is not None:
+                stream(asked, lambda content: self._send(content, sent))
+        except ConnectionError:  # the page was closed, or wants it no more
+            self.close_connection = True
         except MudgError as error:
-            self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode())
-        else:
-            self._answer(HTTPStatus.OK, content, kind)
+            self._tell(error, begun=bool(sent))
+
+    def _tell(self, error: MudgError, begun: bool) -> None:
+        """Answer with a problem; after the first piece of a stream, as a line of it."""
+        if begun:
+            self.wfile.write(store.json_text({"problem": str(error)}, indent=None).encode() + b"\n")
+            return
+        known = {InputError: HTTPStatus.BAD_REQUEST, ResourceError: HTTPStatus.SERVICE_UNAVAILABLE}
+        self._answer(known.get(type(error), HTTPStatus.INTERNAL_SERVER_ERROR), str(error).encode())
+
+    def _send(self, content: bytes, sent: list[int]) -> None:
+        """A piece of a stream; the first one begins the answer, which ends with the connection."""
+        if not sent:
+            self.close_connection = True
+            self._head(HTTPStatus.OK, {"Content-Type": TYPES["bin"], "Connection": "close"})
+        sent.append(len(content))
+        self.wfile.write(content)
 
     def _refused(self, query: Mapping[str, list[str]]) -> bool:
         """Whether the request was refused: another name for this server (a page elsewhere whose name was pointed here), or no token."""
@@ -168,19 +191,23 @@ class SiteRequest(BaseHTTPRequestHandler):
     def _answer(
         self, status: HTTPStatus, content: bytes, kind: str = "text/plain; charset=utf-8", cookie: bool = False
     ) -> None:
-        self.send_response(status)
-        for name, value in {
-            "Content-Type": kind, "Content-Length": str(len(content)), "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
-            "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin", "X-Frame-Options": "DENY",
-        }.items():  # fmt: skip
-            self.send_header(name, value)
+        named = {"Content-Type": kind, "Content-Length": str(len(content))}
         if cookie:
-            self.send_header("Set-Cookie", f"{COOKIE}={self.site.token}; HttpOnly; SameSite=Strict; Path=/")
+            named["Set-Cookie"] = f"{COOKIE}={self.site.token}; HttpOnly; SameSite=Strict; Path=/"
         if status != HTTPStatus.OK:
             self.close_connection = True  # a body may be left unread
-            self.send_header("Connection", "close")
-        self.end_headers()
+            named["Connection"] = "close"
+        self._head(status, named)
         self.wfile.write(content)
+
+    def _head(self, status: HTTPStatus, named: Mapping[str, str]) -> None:
+        self.send_response(status)
+        for name, value in {
+            **named, "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin", "X-Frame-Options": "DENY",
+        }.items():  # fmt: skip
+            self.send_header(name, value)
+        self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: a line per request would hide what matters."""

@@ -24,17 +24,19 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer.chunks import CHUNK
-from mudg.report.viewer.facts import begin_of, log_facts, with_ground
+from mudg.report.viewer.facts import begin_of, log_facts, with_ground, with_particles
 from mudg.report.viewer.packed import Packed, pack_scene
-from mudg.report.viewer.page import ONE_FILE_BYTES, PageFile, ViewerPage
+from mudg.report.viewer.page import ONE_FILE_BYTES, PageFile, ViewerPage, most_within
 from mudg.stages.config.view import PageConfig, ViewConfig
 from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.editing.weathered import SEED
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.viewing.edits import EditFiles, EditRequest, desk_for
-from mudg.stages.viewing.frames import LAYERS, FrameRequest, FrameSource
-from mudg.stages.viewing.server import Answer, Site, address_of, open_server, show, token_for
+from mudg.stages.viewing.frames import LAYERS, FrameRequest, FrameSource, VideoRequest
+from mudg.stages.viewing.server import Answer, Site, Stream, address_of, open_server, show, token_for
 
+MEGABYTE: Final = 1e6
 NAMES: Final = {"mudg_s": "with diffusion", "street_gaussians": "without diffusion"}
 
 
@@ -185,9 +187,9 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     """The page of what is shown."""
     scene, begin = shown.scene, begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    packed = [(name, pack_scene(model, begin, path, config.budget, CHUNK)) for name, model in shown.fits]
+    packed = [(name, pack_scene(model, begin, path, _most(config, model, len(shown.fits)), CHUNK)) for name, model in shown.fits]
     facts = log_facts(scene, shown.fits[0][1].colors, config.image_width_px, config.images, config.lidar_points)
-    facts = with_ground(facts, shown.ground())
+    facts = with_particles(with_ground(facts, shown.ground()), SEED)
     first = packed[0][1]
     return ViewerPage(
         title=scene.id, subtitle=", ".join(f"{name} ({NAMES[name]})" if name in NAMES else name for name, _ in packed),
@@ -195,14 +197,26 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     )  # fmt: skip
 
 
+def _most(config: PageConfig, model: SceneModel, fits: int) -> int:
+    """Gaussians of each fit that budget and memory allow; 0 = all."""
+    if not config.memory_mb:
+        return config.budget
+    most = most_within(MEGABYTE * config.memory_mb / fits, model.sh_degree, CHUNK)
+    return min(config.budget, most) if config.budget else most
+
+
 def about_text(scene: Scene, first: Packed) -> str:
     """A few sentences on the page."""
     return (
         f"{kept_text(first)}, {len(scene.frames)} recorded frames of "
-        f"{len(scene.cameras)} cameras, {len(scene.tracks)} tracked objects. Places, sizes and colours are rounded "
+        f"{_counted(len(scene.cameras), 'camera')}, {_counted(len(scene.tracks), 'tracked object')}. Places, sizes and colours are rounded "
         f"for the page. Data: {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing from elsewhere "
         "and sends nothing."
     )
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def kept_text(packed: Packed) -> str:
@@ -270,9 +284,11 @@ def server_of(
     report = Path(run) / "report.html"
     if report.is_file():
         served["report.html"] = store.read_bytes(report)
+    streams: dict[str, Stream] = {}
     answers: dict[str, Answer] = {"edits": lambda asked: desk.answer(parse_record(EditRequest, asked, "request"))}
     if config.exact:
-        source = FrameSource(desk.edited, config.width_px, drawing_device(config.device, "view"))
+        source = FrameSource(desk.edited, shown.scene, config.width_px, drawing_device(config.device, "view"))
         answers["frame"] = lambda asked: (source.png(parse_record(FrameRequest, asked, "request")), "image/png")
-    site = Site(served, answers, token)
+        streams["video"] = lambda asked, send: source.film(parse_record(VideoRequest, asked, "request"), send)
+    site = Site(served, answers, token, streams)
     return open_server(site, config.host, config.port), site

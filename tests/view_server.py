@@ -1,0 +1,51 @@
+"""The server of ``mudg view`` for tests: running in a thread, and asked over HTTP."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mudg.stages.config.view import ViewConfig
+from mudg.stages.viewing import view
+from mudg.stages.viewing.edits import EditFiles
+
+
+@contextmanager
+def serving(
+    fit: Path, scene: Path, compare: Path | None = None, files: EditFiles | None = None, **settings: object
+) -> Iterator[tuple[int, str]]:
+    """Port and token of a server of a fit."""
+    config = ViewConfig(**{"images": 0, "browser": False, "device": "cpu", **settings})
+    server, site = view.server_of(config, fit, compare, scene, files)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield server.server_address[1], site.token
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def ask(port: int, method: str, path: str, body: object = None, **headers: str) -> tuple[int, bytes]:
+    """Status and content of an answer."""
+    connection, answer = begin(port, method, path, body, **headers)
+    try:
+        with answer:
+            return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def begin(
+    port: int, method: str, path: str, body: object = None, **headers: str
+) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
+    """An answer whose content is still to be read."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(
+        method, path, None if body is None else json.dumps(body), {"Content-Type": "application/json", **named}
+    )
+    return connection, connection.getresponse()
