@@ -1,5 +1,6 @@
 """What work takes: seconds, processor seconds, memory with child processes, bytes; over interrupted runs, too."""
 
+import platform
 import subprocess
 import sys
 import time
@@ -142,6 +143,28 @@ def test_shares_are_asked_for_only_where_a_new_peak_is_possible(monkeypatch: pyt
     time.sleep(3 * usage.PERIOD_S)
     assert meter.stop().peak_bytes == 1 << 50
     assert not asked
+
+
+FREEING = """
+import numpy as np
+from mudg.base import memory, usage
+blocks = [np.ones(12_000) for _ in range(1000)]  # 96 kB each: too small for a mapping of their own
+last = np.ones(12_000)
+full = usage.held_bytes()
+del blocks
+freed = usage.held_bytes()
+memory.give_back()
+print(full, freed, usage.held_bytes())
+"""
+
+
+@needs_proc
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="freed memory is kept, and can be given back, with glibc")
+def test_freed_memory_is_given_back() -> None:
+    said = subprocess.run([sys.executable, "-c", FREEING], check=True, capture_output=True, text=True).stdout
+    full, freed, left = map(int, said.split())
+    assert freed > full - (20 << 20), "the C library keeps what was freed"
+    assert left < full - (80 << 20)
 
 
 def test_the_thread_ends_with_the_last_meter() -> None:
