@@ -105,8 +105,8 @@ POINT_BYTES: Final = 60
 """Per LiDAR point, while points are fused."""
 OWN_PROCESS_BYTES: Final = 300_000_000
 """Of that, what the chain's own process has already."""
-MODEL_BYTES: Final = 570_000_000
-CLIP_PIXEL_BYTES: Final = 6_800
+MODEL_BYTES: Final = 450_000_000
+CLIP_PIXEL_BYTES: Final = 5_600
 """The small diffusion model while it samples: per process, and for each pixel of the camera, to whose size the finisher brings a window."""
 PUBLISHED_BYTES: Final = {"cpu": 19_000_000_000, "cuda": 9_000_000_000}
 """The published one at 576x1024: on the CPU in float32 with all work at once, on CUDA in bfloat16 with the work cut to 10 GB (counted, not
