@@ -264,7 +264,8 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch):
 
     def finished(made, given, frames, scale):
         seen.append((made, scale))
-        return finishing.Finished(made.rgb, made.depth_code, torch.full((len(made.rgb), 19, 24, 24), 1 / 19), made.log_error)
+        whole = torch.ones_like(made.log_error)
+        return finishing.Finished(made.rgb, made.depth_code, made.ids[:, None], whole, made.log_error)
 
     encoded = model.encode_condition([clip.condition for clip in clips])
     stated = {m: torch.zeros(2, frames, c, height // 2, width // 2) for m, c in model.codec.channels.items()}

@@ -8,9 +8,11 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
+from torch.nn import functional
 
 from mudg.base.errors import InputError
 from mudg.core import losses
+from mudg.models import featnets
 from mudg.models.featnets import FilterBank
 
 
@@ -173,6 +175,27 @@ def test_filter_bank_zero_for_equal_images_and_gradient():
     bank, weight = FilterBank(scales=2), torch.rand(1, 16, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     target = bank(image(4, (3, 16, 20)))
     check_gradient(lambda p: losses.feature_distance(bank(p), target, weight), x)
+
+
+def test_slopes_are_those_of_a_convolution():
+    smooth, slope = torch.tensor([1.0, 2, 1], dtype=torch.float64) / 4, torch.tensor([-1.0, 0, 1], dtype=torch.float64) / 2
+    kernels = torch.stack([torch.outer(smooth, slope), torch.outer(slope, smooth)])[:, None]
+    plane, upstream = image(5, (1, 14, 19))[None].requires_grad_(), image(6, (2, 12, 17))[None]
+    wanted, found = functional.conv2d(plane, kernels), featnets._Slope.apply(plane)
+    assert torch.allclose(found, wanted, atol=1e-14)
+    (of_wanted,), (of_found,) = (torch.autograd.grad(out, plane, upstream) for out in (wanted, found))
+    assert torch.allclose(of_found, of_wanted, atol=1e-14)
+
+
+def test_feature_distance_is_the_confident_mean_of_the_difference():
+    mine, theirs = image(7, (4, 9, 11)).requires_grad_(), image(8, (4, 9, 11))
+    theirs[:, 2, 3] = mine.detach()[:, 2, 3]  # no slope there
+    weight = image(9, (1, 9, 11))
+    wanted = losses.confident_mean((mine - theirs).abs(), weight)
+    found = losses.feature_distance([mine], [theirs], weight)
+    assert torch.allclose(found, wanted, atol=1e-14)
+    (of_wanted,), (of_found,) = (torch.autograd.grad(2 * out, mine) for out in (wanted, found))
+    assert torch.allclose(of_found, of_wanted, atol=1e-14)
 
 
 def test_filter_bank_prefers_a_shifted_texture_to_a_blurred_one():

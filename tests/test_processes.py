@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mudg.base.errors import NumericsError
-from mudg.base.processes import Interruption, error_from_record, error_record, process_alive
+from mudg.base.processes import Interruption, calls_beside, error_from_record, error_record, process_alive
 
 PATIENCE_S = 60.0
 
@@ -95,16 +95,22 @@ def call(name: str, folder: Path) -> None:
     {"steps": work_in_steps, "cleanup": work_with_cleanup, "never": sleep_long}[name](folder)
 
 
-def stopped_command(tmp_path: Path, number: int, *, group: bool) -> tuple[int, str, list[int]]:
+IN_TURN = "for _ in run_in_processes(t.call, calls, 2):\n        pass"
+BESIDE = "with calls_beside(t.call, calls, 2):\n        time.sleep(600)"
+
+
+def stopped_command(tmp_path: Path, number: int, *, group: bool, calling: str = IN_TURN) -> tuple[int, str, list[int]]:
     """A command with two workers, two calls that run and three that wait, is sent a signal: exit code, what it said, workers."""
     names = ["steps", "cleanup", "never", "never", "never"]
     given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
     script = (
-        "import signal, sys; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\nimport test_processes as t\nfrom mudg import cli\n"
-        "from mudg.base.processes import run_in_processes\nfrom dataclasses import replace\n"
+        "import signal, sys, time; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\n"
+        "import test_processes as t\nfrom mudg import cli\n"
+        "from mudg.base.processes import calls_beside, run_in_processes\nfrom dataclasses import replace\n"
         "def work(_args):\n"
         "    folders = sorted(Path(sys.argv[1]).glob('[0-9]*'))\n"
-        "    for _ in run_in_processes(t.call, [(f.name[1:], f) for f in folders], 2):\n        pass\n"
+        "    calls = [(f.name[1:], f) for f in folders]\n"
+        f"    {calling}\n"
         "    return {}\n"
         "if __name__ == '__main__':\n"
         "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in what a script starts in the background
@@ -140,3 +146,60 @@ def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int
     assert (tmp_path / "1cleanup" / "tidy").exists()
     assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
     assert not any(process_alive(worker) for worker in workers)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
+def test_a_command_that_is_stopped_stops_the_calls_beside_it(tmp_path: Path) -> None:
+    got, said, workers = stopped_command(tmp_path, signal.SIGTERM, group=False, calling=BESIDE)
+    assert got == 143, said
+    assert (tmp_path / "0steps" / "checkpoint").exists()
+    assert (tmp_path / "1cleanup" / "tidy").exists()
+    assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
+    assert not any(process_alive(worker) for worker in workers)
+
+
+def note(folder: Path, seconds: float, fails: bool) -> None:
+    """A call that takes some time, and writes or fails."""
+    (folder / "started").touch()
+    time.sleep(seconds)
+    if fails:
+        raise NumericsError("it failed", where=folder.name)
+    (folder / "done").touch()
+
+
+def test_calls_beside_a_block_that_ends_are_finished_or_never_begun(tmp_path: Path) -> None:
+    first, second = folders(tmp_path, "first", "second")
+    with calls_beside(note, [(first, 0.5, False), (second, 0.0, False)], 1):
+        wait_for(first / "started")
+    assert (first / "done").exists()
+    begun = [folder for folder in (first, second) if (folder / "started").exists()]
+    assert all((folder / "done").exists() for folder in begun)
+
+
+def fail_beside(given: list[Path]) -> None:
+    with calls_beside(note, [(folder, 0.2, folder.name == "fails") for folder in given], 1):
+        wait_for(given[0] / "started")
+        time.sleep(1.0)
+
+
+def test_a_call_beside_that_fails_is_told_and_the_rest_are_dropped(tmp_path: Path) -> None:
+    given = folders(tmp_path, "fails", *"abcdef")
+    with pytest.raises(NumericsError, match="it failed"):
+        fail_beside(given)
+    assert not (given[-1] / "started").exists()
+
+
+def fail_in_block(folder: Path) -> None:
+    with calls_beside(sleep_long, [(folder,)], 1):
+        wait_for(folder / "started")
+        raise ValueError("in the block")
+
+
+def test_an_error_in_the_block_stops_the_calls_beside_it(tmp_path: Path) -> None:
+    (folder,) = folders(tmp_path, "a")
+    with pytest.raises(ValueError, match="in the block"):
+        fail_in_block(folder)
+    end = time.monotonic() + PATIENCE_S
+    while process_alive(int((folder / "started").read_text())):
+        assert time.monotonic() < end
+        time.sleep(0.05)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
@@ -10,7 +11,9 @@ from toy_scene import ToyStreet
 from mudg import cli
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera, View
 from mudg.core import trajectory
+from mudg.data.clips import condition
 from mudg.data.observations import list_observation_sets, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.mdm import files
@@ -105,6 +108,28 @@ def test_processes_give_the_same_as_one(world, tmp_path):
     for name in ("front_shift+1.0", "front_shift-1.0"):
         for a, b in zip(frames_of(one / name), frames_of(two / name), strict=True):
             assert torch.equal(a.rgb, b.rgb)
+
+
+def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world, tmp_path, monkeypatch):
+    prepared, prepare = [], condition._prepare_source
+    monkeypatch.setattr(condition, "_prepare_source", lambda *given: prepared.append(given[1].view.time_s) or prepare(*given))
+    both = made(world, tmp_path / "both", shifts_m=(1.0, 2.0))
+    assert len(prepared) == len(set(prepared)) > 1
+    assert synthesize._drive_again.cache_info().currsize == 0
+    alone = made(world, tmp_path / "alone", shifts_m=(2.0,))
+    for one, other in zip(*(frames_of(out / "front_shift+2.0") for out in (both, alone)), strict=True):
+        assert torch.equal(one.rgb, other.rgb)
+        assert torch.equal(one.depth.nan_to_num(), other.depth.nan_to_num())
+
+
+def test_prepared_images_are_kept_exactly():
+    levels = torch.arange(256, dtype=torch.uint8).view(1, 16, 16).expand(3, -1, -1)
+    flat, view = torch.ones(16, 16), View(Camera("front", 16, 16, 9.0, 9.0, 8.0, 8.0), np.eye(4), 0.0)
+    images = synthesize.PreparedImages()
+    for number, rgb in enumerate((levels.float() / 255, levels.float() / 255 * 1.01 - 0.003)):
+        images[number] = condition.WarpSource(view, rgb, flat, flat > 2, flat.byte())
+        assert torch.equal(images[number].rgb, rgb)
+    assert dict.__getitem__(images, 0).rgb.dtype == torch.uint8
 
 
 def test_full_size_views_have_the_cameras_size(world, tmp_path):

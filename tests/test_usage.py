@@ -1,5 +1,6 @@
 """What work takes: seconds, processor seconds, memory with child processes, bytes; over interrupted runs, too."""
 
+import platform
 import subprocess
 import sys
 import time
@@ -13,7 +14,11 @@ from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.usage import Meter, Usage
 
 OUTPUT = VerbOutput("work", 1, ("*.txt",))
-needs_proc = pytest.mark.skipif(usage.resident_bytes() is None, reason="the system does not tell the memory of processes (/proc)")
+needs_proc = pytest.mark.skipif(usage.held_bytes() is None, reason="the system does not tell the memory of processes (/proc)")
+
+needs_shares = pytest.mark.skipif(
+    "Pss_Anon" not in usage.system_text("/proc/self/smaps_rollup"), reason="the system tells no proportional set sizes"
+)
 
 
 def wait_until(reached: float) -> None:
@@ -40,7 +45,7 @@ def test_processor_time_of_children_that_have_ended_counts() -> None:
 @needs_proc
 def test_the_peak_holds_memory_that_was_given_back() -> None:
     meter = Meter()
-    before = usage.resident_bytes()
+    before = usage.held_bytes()
     held = np.ones(80 << 17)  # 80 MiB
     time.sleep(3 * usage.PERIOD_S)
     del held
@@ -51,10 +56,115 @@ def test_the_peak_holds_memory_that_was_given_back() -> None:
 @needs_proc
 def test_memory_of_child_processes_counts() -> None:
     meter = Meter()
-    before = usage.resident_bytes()
+    before = usage.held_bytes()
     code = "held = bytearray(90 << 20); held[::4096] = b'1' * len(held[::4096]); import time; time.sleep(1)"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert meter.stop().peak_bytes > before + (80 << 20)
+
+
+SHARING = """
+import sys, time
+import numpy as np
+shared = np.memmap(sys.argv[1], np.uint8, "r")
+assert shared[::4096].sum() == 0
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@needs_proc
+@needs_shares
+def test_what_child_processes_share_counts_once(tmp_path: Path) -> None:
+    size, large = 200 << 20, tmp_path / "large"
+    large.write_bytes(bytes(size))
+    alone = usage.held_bytes()
+    mine = np.memmap(large, np.uint8, "r")
+    assert mine[::4096].sum() == 0
+    meter = Meter()
+    children = [subprocess.Popen([sys.executable, "-c", SHARING, large], stdin=-1, stdout=-1, text=True) for _ in range(2)]
+    try:
+        assert [child.stdout.readline() for child in children] == ["ready\n"] * 2
+        sizes, held = usage.resident_sizes(), usage.held_bytes()
+        time.sleep(3 * usage.PERIOD_S)
+        peak = meter.stop().peak_bytes
+    finally:
+        for child in children:
+            child.communicate()
+    assert sum(size.all_bytes for size in sizes.values()) > alone + 2.9 * size
+    for found in (held, peak):
+        assert alone + 0.9 * size < found < alone + 1.9 * size
+
+
+FORKING = """
+import os, time
+import numpy as np
+from mudg.base import usage
+held = np.ones(25 << 20)
+alone = usage.held_bytes()
+theirs, ours = os.pipe()
+child = os.fork()
+if not child:
+    os.close(ours)
+    os.read(theirs, 1)
+    os._exit(0)
+together, sizes = usage.held_bytes(), usage.resident_sizes()
+os.close(ours)
+os.waitpid(child, 0)
+print(alone, together, sum(size.all_bytes for size in sizes.values()))
+"""
+
+
+@needs_proc
+@needs_shares
+def test_memory_that_a_forked_process_has_not_changed_counts_once() -> None:
+    said = subprocess.run([sys.executable, "-c", FORKING], check=True, capture_output=True, text=True).stdout
+    alone, together, resident = map(int, said.split())
+    assert resident > alone + (200 << 20)
+    assert alone < together < alone + (20 << 20)
+
+
+@needs_proc
+def test_where_no_shares_are_told_resident_sizes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = usage.system_text
+    monkeypatch.setattr(usage, "system_text", lambda path: "" if "smaps" in path else text(path))
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=-1)
+    sizes = usage.resident_sizes()
+    assert len(sizes) == 2
+    assert usage.held_bytes(sizes) == sum(size.all_bytes for size in sizes.values())
+    child.communicate(b"\n")
+
+
+@needs_proc
+def test_shares_are_asked_for_only_where_a_new_peak_is_possible(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, held_bytes = [], usage.held_bytes
+    meter = Meter()
+    meter.seen(1 << 50)
+    monkeypatch.setattr(usage, "held_bytes", lambda *given: asked.append(1) or held_bytes(*given))
+    time.sleep(3 * usage.PERIOD_S)
+    assert meter.stop().peak_bytes == 1 << 50
+    assert not asked
+
+
+FREEING = """
+import numpy as np
+from mudg.base import memory, usage
+blocks = [np.ones(12_000) for _ in range(1000)]  # 96 kB each: too small for a mapping of their own
+last = np.ones(12_000)
+full = usage.held_bytes()
+del blocks
+freed = usage.held_bytes()
+memory.give_back()
+print(full, freed, usage.held_bytes())
+"""
+
+
+@needs_proc
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="freed memory is kept, and can be given back, with glibc")
+def test_freed_memory_is_given_back() -> None:
+    said = subprocess.run([sys.executable, "-c", FREEING], check=True, capture_output=True, text=True).stdout
+    full, freed, left = map(int, said.split())
+    assert freed > full - (20 << 20), "the C library keeps what was freed"
+    assert left < full - (80 << 20)
 
 
 def test_the_thread_ends_with_the_last_meter() -> None:

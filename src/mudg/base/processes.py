@@ -1,7 +1,8 @@
 """Processes, threads, interrupts, and errors that cross a process boundary. Everything of that kind in the package is here.
 
     run_in_processes    one function over many arguments, several processes at a time
-    process_pool        the processes themselves, for work that goes on beside other work
+    calls_beside        the same while the caller does something else
+    process_pool        the processes themselves
     computed_ahead      one function over numbers in order, several threads at a time
     run_limited         one call on a foreign file, under a limit of address space
     Interruption        Ctrl-C and SIGTERM wait for the end of a step
@@ -213,6 +214,47 @@ def run_in_processes(
             pool.shutdown(wait=True, cancel_futures=True)
             raise
         pool.shutdown()
+
+
+@contextlib.contextmanager
+def calls_beside(function: Callable[..., object], arguments: Sequence[tuple[Any, ...]], processes: int) -> Iterator[None]:
+    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each while the block runs.
+
+    Once a call fails, none begins any more. At the end of the block calls that have not begun are dropped, and those that run are waited
+    for; where the block ends with an error or is stopped (Ctrl-C, SIGTERM), they are stopped, too.
+
+    Raises:
+        ResourceError: a process ended from outside. Whatever the function raises, at the end of the block.
+    """
+    with child_environment(1):
+        pool = process_pool(processes)
+        futures = [pool.submit(_stoppable, function, items) for items in arguments]
+
+    def drop_rest(done: concurrent.futures.Future[Any]) -> None:
+        if not done.cancelled() and done.exception() is not None:
+            for future in futures:
+                future.cancel()
+
+    for future in futures:
+        future.add_done_callback(drop_rest)
+    try:
+        yield
+    except BaseException:
+        _stop(pool)
+        raise
+    try:
+        for future in futures:
+            future.cancel()
+        for _ in _as_completed(pool, {future: index for index, future in enumerate(futures) if not future.cancelled()}):
+            pass
+    except KeyboardInterrupt:
+        _stop(pool)
+        raise
+    except BrokenProcessPool as error:
+        _kill(pool)
+        raise ended_process(str(error)) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _as_completed(

@@ -5,26 +5,36 @@
     meter.stop()        Usage(seconds=12.3, processor_s=20.1, peak_bytes=812345678)
 
 Memory is looked at every `PERIOD_S` by one thread for all meters, at the start and at the end: a peak that lasts less is missed. It is
-known where the system has ``/proc``, else None.
+known where the system has ``/proc``, else None. A page that several of the processes share counts once (Linux: proportional set sizes).
+Asking for these costs about 15 ms per GB, so it is done only when the resident sizes allow a new peak, and never for more than
+`MOST_OF_TIME` of the time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import threading
 import time
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mudg.base.memory import system_text
 
 PERIOD_S: Final = 0.25
-_RESIDENT: Final = 1
-"""Column of ``statm``: resident pages."""
+MOST_OF_TIME: Final = 0.05
+_PROPORTIONAL: Final = re.compile(r"^(Pss|Pss_Anon):\s+(\d+) kB", re.MULTILINE)
+
+
+class Resident(NamedTuple):
+    """Memory of a process: all that is resident, and of that mapped files and shared memory."""
+
+    all_bytes: int
+    mapped_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +66,26 @@ class Meter:
 
     def __init__(self) -> None:
         self._began_s, self._processor_s = time.monotonic(), _processor_seconds()
-        self._peak = resident_bytes()
+        self._peak = held_bytes()
         self._last: Usage | None = None
         _SAMPLER.add(self)
 
-    def seen(self, resident: int | None) -> None:
+    def seen(self, held: int | None) -> None:
         """Take a sample of memory."""
-        if resident is not None:
-            self._peak = max(self._peak or 0, resident)
+        if held is not None:
+            self._peak = max(self._peak or 0, held)
+
+    def exceeded_by(self, held: int) -> bool:
+        """Whether so many bytes were a new peak."""
+        return held > (self._peak or 0)
 
     def usage(self) -> Usage:
         """Up to now; after `stop`, up to then."""
         if self._last is not None:
             return self._last
-        self.seen(resident_bytes())
+        sizes = resident_sizes()
+        if self.exceeded_by(_most(sizes)):
+            self.seen(held_bytes(sizes))
         return Usage(time.monotonic() - self._began_s, _processor_seconds() - self._processor_s, self._peak)
 
     def stop(self) -> Usage:
@@ -100,6 +116,7 @@ class _Sampler:
             self._meters.discard(meter)
 
     def _sample(self) -> None:
+        rest_until_s = 0.0
         while True:
             time.sleep(PERIOD_S)
             with self._lock:
@@ -107,26 +124,60 @@ class _Sampler:
                 if not meters:
                     self._thread = None
                     return
-            resident = resident_bytes()
-            for meter in meters:
-                meter.seen(resident)
+            began_s, sizes = time.monotonic(), resident_sizes()
+            if began_s >= rest_until_s and any(meter.exceeded_by(_most(sizes)) for meter in meters):
+                held, now_s = held_bytes(sizes), time.monotonic()
+                rest_until_s = now_s + (now_s - began_s) / MOST_OF_TIME
+                for meter in meters:
+                    meter.seen(held)
             meters = []  # a meter that nobody else holds may go
 
 
 _SAMPLER: Final = _Sampler()
 
 
-def resident_bytes() -> int | None:
-    """Memory that this process and its descendants hold now; pages that they share count for each. None where the system does not say."""
-    total, waiting, page = 0, [os.getpid()], os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
+def held_bytes(sizes: Mapping[int, Resident] | None = None) -> int | None:
+    """Memory that this process and its descendants hold now; what several of them share counts once. None where the system does not say.
+
+    Own memory is the sum of proportional sizes. Of mapped files (libraries, mostly) at least the most that one process has resident
+    counts: in proportional sizes a part of them belongs to programs that are not ours. Where the system tells no such sizes (Linux
+    does), resident ones are added up.
+
+    Args:
+        sizes: what `resident_sizes` said just now.
+    """
+    sizes = resident_sizes() if sizes is None else sizes
+    if len(sizes) < 2:
+        return sum(size.all_bytes for size in sizes.values()) or None
+    own, mapped, mapped_by_one = 0, 0, 0
+    for process, size in sizes.items():
+        found = dict(_PROPORTIONAL.findall(system_text(f"/proc/{process}/smaps_rollup")))
+        if len(found) < 2:  # it ended meanwhile, or the system tells none
+            own += size.all_bytes
+            continue
+        own += 1024 * int(found["Pss_Anon"])
+        mapped += 1024 * (int(found["Pss"]) - int(found["Pss_Anon"]))
+        mapped_by_one = max(mapped_by_one, size.mapped_bytes)
+    return own + max(mapped, mapped_by_one)
+
+
+def resident_sizes() -> dict[int, Resident]:
+    """Resident memory of this process and of its descendants, by process; empty where the system does not say."""
+    sizes, waiting, page = {}, [os.getpid()], os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
     while waiting:
-        process = f"/proc/{waiting.pop()}"
-        pages = system_text(f"{process}/statm").split()
-        total += int(pages[_RESIDENT]) * page if len(pages) > _RESIDENT else 0
+        process = waiting.pop()
+        pages = system_text(f"/proc/{process}/statm").split()
+        if len(pages) > 2:
+            sizes[process] = Resident(int(pages[1]) * page, int(pages[2]) * page)
         with contextlib.suppress(OSError):  # it ended meanwhile
-            for thread in os.listdir(f"{process}/task"):
-                waiting += map(int, system_text(f"{process}/task/{thread}/children").split())
-    return total or None
+            for thread in os.listdir(f"/proc/{process}/task"):
+                waiting += map(int, system_text(f"/proc/{process}/task/{thread}/children").split())
+    return sizes
+
+
+def _most(sizes: Mapping[int, Resident]) -> int:
+    """More than this cannot be held."""
+    return sum(size.all_bytes for size in sizes.values())
 
 
 def folder_bytes(folder: Path) -> int:

@@ -38,7 +38,8 @@ _DEPTH_STOPS: Final = np.array(
 
 
 def resize_area(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Image u8[H, W, 3] to another size by averaging areas (Pillow's box filter); the same array if the size is right already."""
+    """Image u8[H, W, 3] or plane u8[H, W] to another size by averaging areas (Pillow's box filter); the same array if the size is right
+    already."""
     if rgb.shape[:2] == (height, width):
         return rgb
     return np.array(Image.fromarray(rgb).resize((width, height), Image.Resampling.BOX))

@@ -58,6 +58,7 @@ from mudg.stages.fitting.continued import (
     whole_run,
 )
 from mudg.stages.fitting.finite import FiniteCheck
+from mudg.stages.fitting.halved import HalvedViews
 from mudg.stages.fitting.kept import chosen_ahead, keep, recorded_bytes, scratch_folder, virtual_bytes
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
 from mudg.stages.fitting.perception import Perception, perception_of
@@ -304,10 +305,11 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     raster, perception = raster_of(state.model, config.raster, config.drawing.packed), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
+    sizes = HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
 
     def choose(step: int) -> tuple[StoredView, ...]:
         probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-        return state.views.choose(config.seed, step, probability, config.virtual.beside)
+        return tuple(sizes.sized(view, step) for view in state.views.choose(config.seed, step, probability, config.virtual.beside))
 
     with (
         log.task(f"fit {config.method}", config.iterations, state.step) as bar,

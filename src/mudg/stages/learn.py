@@ -167,7 +167,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         config = learn_clips.for_logs(config, rules, *counts)
         about_data = learn_clips.describe_logs(config, rules)
     elif isinstance(folder, Path) and ranks.leads:
-        making = learn_clips.MakingClips(config, folder, model.points_alone)
+        making = learn_clips.making_clips(config, folder, model.points_alone)
     if model.points_alone:
         config = learn_clips.of_one_size(config)
     with making:

@@ -361,12 +361,16 @@ class _Ledger:
         self.save("complete")
 
     def timed(self, step: Step) -> Any:
-        """Do one step and add its seconds, also when it is interrupted; a reused result adds none."""
+        """Do one step and add its seconds, also when it is interrupted; a reused result adds none. The next step begins with the memory
+        that this one took given back."""
+        from mudg.core.raster.cpu import release_memory
+
         finished = self._steps.get(step.name, {}).get("state") == "complete" and (self._out / step.folder).exists()
         meter, state = Meter(), "interrupted"
         log.info(f"== {step.name}")
         try:
             path = step.make()
+            release_memory()
             state = "complete"
         finally:
             spent, known = meter.stop(), self._steps.get(step.name, {})

@@ -15,7 +15,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,12 @@ from mudg.base.types import Condition, Frame, FusedCloud, Observation, Photo, Sc
 from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
+from mudg.core.raster.cpu import release_memory
 from mudg.data.clips.ablated import ConditionParts, ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules, WarpSource
 from mudg.data.clips.near_points import NearSweeps
+from mudg.data.clips.vacated import VacatedAt
+from mudg.data.clips.weathered import InWeather
 from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript
 from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
@@ -48,6 +51,7 @@ from mudg.models.mdm.codec import Modality
 from mudg.models.mdm.files import digest, folder_of, takes_effects
 from mudg.models.mdm.model import MDM
 from mudg.models.published.files import is_published
+from mudg.models.scene.model import SceneModel
 from mudg.stages import fuse
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.editing import weathered as editing_weather
@@ -124,7 +128,10 @@ def run(
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
     inputs_of = JobInputs(Path(scene), Path(fused), fitted, script)
     jobs = [(config, inputs_of, directory.path, path, model) for path in paths]
-    frames = _run_jobs(jobs, names, processes)
+    try:
+        frames = _run_jobs(jobs, names, processes)
+    finally:
+        _drive_again.cache_clear()
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     directory.finish({"trajectories": names, "views": frames})
@@ -169,6 +176,7 @@ def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: 
     """Make the trajectories, each in one thread, several processes at a time; returns the number of views."""
     processes = min(processes, len(jobs))
     if processes > 1:
+        release_memory()
         log.info_once(f"synthesize: {processes} processes with one thread each")
     made = 0
     with log.task("synthesize", len(jobs)) as bar:
@@ -275,6 +283,7 @@ def make_trajectory(
             store.write_json(state / FITS, fits)
             store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
+            del sample, condition, observations, observation  # before the next window is made
         rows = [store.read_safetensors(file)["row"] for file in sorted(state.glob("row*.safetensors"))]
         if rows:
             store.write_image(folder / "overview.png", np.concatenate(rows))
@@ -284,8 +293,20 @@ def make_trajectory(
     return len(path)
 
 
-def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel) -> ViewMaker:
-    """What makes the views of one trajectory."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drive:
+    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of a size."""
+
+    scene: Scene
+    cloud: FusedCloud
+    recorded: list[Photo]
+    fit: SceneModel | None = None
+    vacated: VacatedAt | None = None
+    weather: InWeather | None = None
+    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
+
+
+def _drive_of(config: SynthesizeConfig, given: JobInputs) -> _Drive:
     scene, cloud = read_scene(given.scene), read_fused(given.fused)
     fit = None if given.fitted is None else load_model(given.fitted)
     recorded, vacated, weather = recorded_images(scene, config), None, None
@@ -296,16 +317,28 @@ def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, mo
         asked = editing_weather.conditions_of(given.script.canonical())
         if asked is not None and fit is not None and shows_weather(config, given.script, True):
             weather = editing_weather.weather_of(functools.partial(render_view, fit, raster=raster_of(fit)), asked, scene)
-    cloud = cloud if config.given_classes else without_classes(cloud)
+    return _Drive(scene, cloud if config.given_classes else without_classes(cloud), recorded, fit, vacated, weather)
+
+
+_drive_again = functools.lru_cache(maxsize=1)(_drive_of)
+"""The same for the next trajectory of a run; ``run`` forgets it."""
+
+
+def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel) -> ViewMaker:
+    """What makes the views of one trajectory."""
+    drive = _drive_again(config, given) if given.script is None else _drive_of(config, given)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
     model.check_clip(min(len(path), model.config.window), height, width)
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     rules = rules if given.script is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
-    render_at = None if fit is None else functools.partial(render_planes, fit)
-    near = near_sweeps(scene, cloud, path) if config.condition == FREEVS else None
-    return ViewMaker(model, ConditionSources(cloud, scene.tracks, recorded, rules, render_at, near, vacated, weather), config)
+    render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
+    near = near_sweeps(drive.scene, drive.cloud, path) if config.condition == FREEVS else None
+    sources = ConditionSources(
+        drive.cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
+    )
+    return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages()))
 
 
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
@@ -314,6 +347,18 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     if not files:
         return 0, {}
     return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
+
+
+class PreparedImages(dict[int, WarpSource]):
+    """Images made ready for warping, for all windows and trajectories that a process makes; colours as bytes where that is exact."""
+
+    def __setitem__(self, number: int, image: WarpSource) -> None:
+        coarse = (image.rgb * 255).round().clamp(0, 255).to(torch.uint8)
+        super().__setitem__(number, replace(image, rgb=coarse) if torch.equal(coarse.float() / 255, image.rgb) else image)
+
+    def __getitem__(self, number: int) -> WarpSource:
+        image = super().__getitem__(number)
+        return image if image.rgb.is_floating_point() else replace(image, rgb=image.rgb.float() / 255)
 
 
 StartAt = Callable[[Sequence[View]], StartClip]
@@ -325,16 +370,18 @@ class ViewMaker:
 
     Args:
         start_at: what clips begin from, and how far they may leave it (``StartClip``).
+        images: recorded images that were prepared before, for views of this size; None: none.
     """
 
     def __init__(
-        self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig, start_at: StartAt | None = None
-    ) -> None:
+        self, model: loading.DiffusionModel, given: ConditionSources, config: SynthesizeConfig, start_at: StartAt | None = None,
+        images: PreparedImages | None = None,
+    ) -> None:  # fmt: skip
         if not given.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._given, self._full_size = model, given, config.full_size
         self._parts: ConditionParts = config.condition
-        self._sources: dict[int, WarpSource] = {}
+        self._images = PreparedImages() if images is None else images
         self._request = loading.request_of(config, loading.half_of(config) == torch.bfloat16)
         self._start_at = start_at
 
@@ -346,7 +393,8 @@ class ViewMaker:
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None
     ) -> tuple[GeneratedClip, Condition, list[Observation]]:
         """Sample window `number` at `views`; `known` latents [k,C,h,w] fix its first k frames."""
-        condition, fine = conditions_of(self._given, self._parts, views, self._sources)
+        condition, fine = conditions_of(self._given, self._parts, views, self._images)
+        release_memory()  # of renders for the condition: the model needs more than they do
         start = None if self._start_at is None else self._start_at(condition.views)
         request = replace(self._request, index=number, known=known, start=start)
         sample, made, made_views = self._generated(condition, fine, views, request)

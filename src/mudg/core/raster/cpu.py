@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mudg import native
+from mudg.base import memory
 from mudg.base.errors import InputError, NumericsError, ResourceError
 from mudg.base.types import Camera, Render
 from mudg.core.raster.request import Drawn, Request, joined, trace_leaves
@@ -116,13 +117,15 @@ def _recycled_like(tensor: Tensor) -> Tensor:
 
 
 def release_memory() -> None:
-    """Free the working memory that is not in use: contexts of the library and memory kept for gradients."""
+    """Free the working memory that is not in use, contexts of the library and memory kept for gradients, and hand all that is free to
+    the system: for work that follows and renders nothing for a while, here or in other processes."""
     global _last_handle
     _last_handle = 0
     _Loan.free.clear()
     library = native.library()
     while library is not None and _Context._free:
         library.mudg_raster_free(_Context._free.pop())
+    memory.give_back()
 
 
 _PARTS: Final = ("means", "quats", "scales", "opacity", "sh", "extra", "sh_rest")

@@ -134,5 +134,5 @@ def load(path: Path | str = "embedded") -> MDM:
     model = MDM(config_from_dict(content.get("config"), str(folder / MODEL_FILE)))
     state, wanted = shards.read_shards(folder, content["files"]), model.state_dict()
     shards.check_fit(state, wanted, folder)
-    model.load_state_dict({name: value.to(wanted[name].dtype) for name, value in state.items()})
+    model.load_state_dict(state)  # the numbers are converted as they are copied: no second set of them is in memory
     return model.eval()

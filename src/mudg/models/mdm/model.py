@@ -484,7 +484,9 @@ class MDM(nn.Module):
                 decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
-                made = self._made(self.refine(latents, encoded.pixels, len(condition.views), encoded.effect))
+                pixels, effect = encoded.pixels, encoded.effect
+                del encoded  # its planes are large
+                made = self._made(self.refine(latents, pixels, len(condition.views), effect))
                 decoded, log_error = self._decoded(made), made.log_error
                 confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
                 if request.n_samples > 1:

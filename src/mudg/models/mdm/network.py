@@ -355,6 +355,13 @@ def shares(ids: Tensor) -> Tensor:
     return functional.avg_pool2d(one_hot(ids), 2)
 
 
+def joined(planes: list[Tensor], dtype: torch.dtype) -> Tensor:
+    """Planes [N,C,h,w] in one tensor of a type. The list is emptied: they are large, and nothing else needs them."""
+    whole = torch.cat([plane.to(dtype) for plane in planes], 1)
+    planes.clear()
+    return whole
+
+
 class CellNet(nn.Module):
     """What refiner and finisher have in common: residual blocks on cells of 2x2 pixels, around others on cells of 4x4.
 
@@ -390,7 +397,9 @@ class CellNet(nn.Module):
         """[N,inside,h,w] -> f32[N,outside/4,2h,2w]; `frames` neighbouring ones belong together. `tuning`: what an effect adds."""
         steps = None if tuning is None else tuning.steps()
         tuned = _untuned if steps is None else lambda x: x + next(steps).of(x)
-        x = self.enter(planes.contiguous(memory_format=torch.channels_last))
+        planes = planes.contiguous(memory_format=torch.channels_last)
+        x = self.enter(planes)
+        del planes  # they are large
         for block in self.before:
             x = tuned(block(x, frames))
         y = self.shrink(x)
@@ -453,7 +462,7 @@ class Refiner(CellNet):
                   shares(given.backdrop_ids)]  # fmt: skip
         if self.renders:
             planes += [*(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)), shares(given.render_ids)]
-        out = self.pixels(torch.cat([p.to(rgb.dtype) for p in planes], 1), frames, tuning)
+        out = self.pixels(joined(planes, rgb.dtype), frames, tuning)
         parts = out.split([size // 4 for size in self.sizes], 1)
         more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[: len(self.SIZES)]
         if self.renders:

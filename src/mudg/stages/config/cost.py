@@ -27,6 +27,8 @@ PIXEL_STEP_S: Final = 0.36e-6
 """A step of a fit, per Gaussian and per pixel: 82.4 ms at 75,000 and 480x320 (bench/fit.py --threads 1); 65 ms at 120,000 and 240x160."""
 VIRTUAL_PIXEL_S: Final = 0.75e-6
 """What a virtual view beside the recorded one takes more than that, per pixel: features of both pictures, dense depth."""
+HALVED_PX: Final = 96
+"""Virtual views whose sides would be shorter are not used at half their size (stages/fitting/halved.py)."""
 SHARED: Final = 0.79
 """Share of a step that is divided among the cores: 101 ms on one core became 61 on two (bench/fit.py)."""
 CLIP_STEP_S: Final = 0.0225
@@ -103,8 +105,8 @@ POINT_BYTES: Final = 60
 """Per LiDAR point, while points are fused."""
 OWN_PROCESS_BYTES: Final = 300_000_000
 """Of that, what the chain's own process has already."""
-MODEL_BYTES: Final = 570_000_000
-CLIP_PIXEL_BYTES: Final = 6_800
+MODEL_BYTES: Final = 450_000_000
+CLIP_PIXEL_BYTES: Final = 5_600
 """The small diffusion model while it samples: per process, and for each pixel of the camera, to whose size the finisher brings a window."""
 PUBLISHED_BYTES: Final = {"cpu": 19_000_000_000, "cuda": 9_000_000_000}
 """The published one at 576x1024: on the CPU in float32 with all work at once, on CUDA in bfloat16 with the work cut to 10 GB (counted, not
@@ -244,7 +246,9 @@ def _work(config: RunConfig, size: SceneSize, workers: tuple[int, int]) -> dict[
     step_s = GAUSSIAN_STEP_S * gaussians + PIXEL_STEP_S * fit_pixels * classes
     further = 0.5 * fit.iterations if config.continue_fit else fit.iterations
     share = virtual.continued_probability if config.continue_fit else virtual.probability
-    beside = share * virtual.beside * step_s + share * VIRTUAL_PIXEL_S * fit_pixels
+    halved = 1 - 0.75 * _halved_share(config, size)
+    virtual_step_s = GAUSSIAN_STEP_S * gaussians + PIXEL_STEP_S * fit_pixels * classes * halved
+    beside = share * virtual.beside * virtual_step_s + share * VIRTUAL_PIXEL_S * fit_pixels * halved
     made, rendered = _views(config, size)
     per_view = CLIP_STEP_S * config.synthesize.steps + CLIP_S + FULL_VIEW_S * pixels
     synthesized = (PROCESS_S * processes if processes > 1 else LOAD_S) + made * config.synthesize.samples * per_view
@@ -267,6 +271,15 @@ def _work(config: RunConfig, size: SceneSize, workers: tuple[int, int]) -> dict[
 
 def _adapts(config: RunConfig, size: SceneSize) -> bool:
     return size.adapts and config.adaptation != "off" and not _published(config)
+
+
+def _halved_share(config: RunConfig, size: SceneSize) -> float:
+    """Share of the virtual views' steps that see them at half their size."""
+    virtual = config.fit.virtual
+    begin = 0.5 if config.continue_fit else virtual.start
+    if min(size.width, size.height) // 2 < HALVED_PX or virtual.stop <= begin:
+        return 0.0
+    return min(1.0, max(0.0, (virtual.half_size - begin) / (virtual.stop - begin)))
 
 
 def _lessons(config: RunConfig) -> int:

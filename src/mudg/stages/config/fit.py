@@ -151,6 +151,9 @@ class VirtualConfig:
     stop: float = Field(default=0.9, ge=0, le=1)
     """Share of the iterations after which virtual views are no longer used, 0 to 1. Ending on recorded views restores quality on
     the recorded path."""
+    half_size: float = Field(default=0.8, ge=0, le=1)
+    """Share of the iterations up to which virtual views are used at half their size, 0 to 1: faster, with little loss. 0: always at
+    full size. A fit that continues a finished one begins at 0.5."""
     gaussians: int = Field(default=8000, ge=0)
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
     densify: bool = False

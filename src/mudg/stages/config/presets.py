@@ -33,7 +33,7 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         "ingest.city.n_frames": 60, "ingest.city.width": 960, "ingest.city.height": 640,
         "fit.iterations": 30_000, "fit.checkpoint_every": 2500, "fit.preview_every": 2500,
         "fit.start.gaussians": 1_000_000, "fit.start.voxel_m": 0.08, "fit.densify.max_gaussians": 3_000_000,
-        "fit.loss.semantic_every": 1, "fit.virtual.gaussians": 200_000,
+        "fit.loss.semantic_every": 1, "fit.virtual.gaussians": 200_000, "fit.virtual.half_size": 0.0,
         "synthesize.steps": 2,  # of the shipped model; more lowered its scores (docs/diffusion.md)
     },
     "paper": {
@@ -53,7 +53,7 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         "fit.virtual.probability": 0.2, "fit.virtual.beside": False, "fit.virtual.start": 0.1, "fit.virtual.stop": 1.0,
         "fit.virtual.gaussians": 0, "fit.virtual.confidence_power": 0.0, "fit.virtual.color_weight": 0.0,
         "fit.virtual.perceptual_weight": 0.1, "fit.virtual.perception": "lpips", "fit.virtual.depth_weight": 0.1,
-        "fit.virtual.lidar_weight": 0.0, "fit.virtual.semantic_weight": 0.1,
+        "fit.virtual.lidar_weight": 0.0, "fit.virtual.semantic_weight": 0.1, "fit.virtual.half_size": 0.0,
     },
 }  # fmt: skip
 """Preset -> setting -> value; settings that are not named have their defaults."""

@@ -126,7 +126,7 @@ def _observed(model: SceneModel, render: Render, view: View, sky_below_alpha: fl
     semantics = None
     if render.extra is not None:
         rows = zip(render.extra.split(_ROWS, 1), render.alpha.split(_ROWS, 1), strict=True)  # no copy of all classes at once
-        channel = torch.cat([composite_semantics(model, extra, alpha).argmax(0) for extra, alpha in rows])
+        channel = torch.cat([composite_semantics(model, extra, alpha).max(0).indices for extra, alpha in rows])
         semantics = torch.tensor(model.classes).to(channel.device, non_blocking=True)[channel]
         if model.sky is not None:
             semantics = torch.where(covered[0], semantics, palette.ID["sky"])

@@ -89,15 +89,18 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), depth)
     carried = [(node, found) for node in objects if (found := _in_box(node, points, stored.view.time_s)) is not None]
     seen = np.zeros(len(points), bool)
-    for witness in witnesses:
-        moved = points.copy()
-        exists = np.ones(len(points), bool)
+    for witness in sorted(witnesses, key=lambda one: abs(one.view.time_s - stored.view.time_s)):  # who sees most comes first
+        left = np.flatnonzero(~seen)
+        place = np.full(len(points), -1)
+        place[left] = np.arange(len(left))
+        moved, exists = points[left], np.ones(len(left), bool)
         for node, (inside, local) in carried:
-            pose = node.pose_matrix(witness.view.time_s)
-            exists[inside] = pose is not None
+            pose, waiting = node.pose_matrix(witness.view.time_s), place[inside] >= 0
+            here = place[inside][waiting]
+            exists[here] = pose is not None
             if pose is not None:
-                moved[inside] = geometry.transform_points(pose, local)
-        seen |= exists & _sees_or_sees_past(witness, moved)
+                moved[here] = geometry.transform_points(pose, local[waiting])
+        seen[left] = exists & _sees_or_sees_past(witness, moved)
     coarse = ~seen.reshape(shape)
     return np.repeat(np.repeat(coarse, STRIDE_PX, 0), STRIDE_PX, 1)[:height, :width]
 

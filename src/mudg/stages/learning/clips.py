@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from mudg.base import log, seeds
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
-from mudg.base.processes import child_environment, process_pool, run_in_processes
+from mudg.base.processes import calls_beside, run_in_processes
 from mudg.base.types import Clip
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
@@ -70,43 +70,16 @@ def without_renders(config: LearnConfig) -> LearnConfig:
     return replace(config, data=replace(config.data, renders=False))
 
 
-class MakingClips:
-    """Processes that make the missing clips of cities, held-out ones first, while the block runs."""
-
-    def __init__(self, config: LearnConfig, folder: Path, points_alone: bool = False) -> None:
-        self._rules, self._folder = clip_rules(config, points_alone), folder
-        wanted = [*held_out_cities(config), *(config.data.skip_cities + n for n in range(config.data.cities))]
-        self._missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
-        self._workers = config.compute.workers
-        self._pool: concurrent.futures.ProcessPoolExecutor | None = None
-        self._futures: list[concurrent.futures.Future[int]] = []
-
-    def __enter__(self) -> None:
-        if not self._missing or self._workers == 0:
-            return
-        log.info(f"learn: {len(self._missing)} cities to generate into {self._folder}, {self._workers} processes")
-        self._pool = process_pool(self._workers)
-        with child_environment(1):
-            make = city_fits.write_fitted_city if self._rules.fitted else from_city.write_city
-            self._futures = [self._pool.submit(make, self._rules, n, self._folder) for n in self._missing]
-        for future in self._futures:
-            future.add_done_callback(_stop_all_on_error(self._futures))
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-        for future in self._futures:
-            if not future.cancelled() and future.exception() is not None:
-                raise future.exception()  # type: ignore[misc]
-
-
-def _stop_all_on_error(futures: list[concurrent.futures.Future[int]]) -> Any:
-    def stop(done: concurrent.futures.Future[int]) -> None:
-        if not done.cancelled() and done.exception() is not None:
-            for other in futures:
-                other.cancel()
-
-    return stop
+def making_clips(config: LearnConfig, folder: Path, points_alone: bool = False) -> contextlib.AbstractContextManager[None]:
+    """A block while which processes make the missing clips of cities, held-out ones first (see ``calls_beside``)."""
+    rules = clip_rules(config, points_alone)
+    wanted = [*held_out_cities(config), *(config.data.skip_cities + n for n in range(config.data.cities))]
+    missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
+    if not missing or config.compute.workers == 0:
+        return contextlib.nullcontext()
+    log.info(f"learn: {len(missing)} cities to generate into {folder}, {config.compute.workers} processes")
+    make = city_fits.write_fitted_city if rules.fitted else from_city.write_city
+    return calls_beside(make, [(rules, n, folder) for n in missing], config.compute.workers)
 
 
 def await_shard(folder: Path | ShardSource, city: int, patience_s: float = 900.0) -> None:

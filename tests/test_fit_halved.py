@@ -1,0 +1,72 @@
+"""Virtual views at half their size: what they show, and which steps see them so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mudg.base import geometry
+from mudg.base.types import Camera, View
+from mudg.stages.fitting.halved import LEAST_PX, HalvedViews, halved
+from mudg.stages.fitting.views import LidarPixels, StoredView
+
+WIDTH, HEIGHT = 241, 196
+RNG = np.random.default_rng(0)
+
+
+def stored(width: int = WIDTH, height: int = HEIGHT, kind: str = "virtual") -> StoredView:
+    view = View(Camera("front", width, height, 200.0, 210.0, 0.51 * width, 0.48 * height), np.eye(4), 0.0)
+    return StoredView(
+        "front_shift+2.0/000001", view, kind, RNG.integers(0, 255, (height, width, 3), np.uint8),
+        RNG.integers(0, 9, (height, width), np.uint8),
+        RNG.random((height, width)) < 0.5, RNG.random((height, width)) < 0.9, None, RNG.random((height, width), np.float32),
+        RNG.integers(0, 255, (height, width), np.uint8),
+    )  # fmt: skip
+
+
+def test_colours_are_means_and_labels_those_of_a_pixel() -> None:
+    whole = stored(240)
+    half = halved(whole)
+    blocks = whole.rgb.reshape(98, 2, 120, 2, 3).astype(float)
+    assert np.abs(half.rgb - blocks.mean((1, 3))).max() <= 1  # rows and columns are rounded one after the other
+    sure = whole.confidence.reshape(98, 2, 120, 2).astype(float)
+    assert np.abs(half.confidence - sure.mean((1, 3))).max() <= 1
+    assert np.array_equal(half.mask, whole.mask.reshape(98, 2, 120, 2).all((1, 3)))
+    for name in ("channels", "sky", "depth"):
+        assert np.array_equal(getattr(half, name), getattr(whole, name)[1::2, 1::2])
+
+
+@pytest.mark.parametrize("width", [240, 241])
+def test_a_measured_point_lies_in_the_pixel_that_shows_it(width: int) -> None:
+    whole = stored(width)
+    points = np.stack([RNG.uniform(-1, 1, 500), RNG.uniform(-0.8, 0.8, 500), RNG.uniform(2, 9, 500)], 1)
+
+    def flat(view: View) -> np.ndarray:
+        uv, _ = geometry.project(view, points)
+        assert (uv > 0).all() and (uv < [view.camera.width, view.camera.height]).all()
+        return uv.astype(int) @ [1, view.camera.width]
+
+    half = halved(replace(whole, lidar=LidarPixels(torch.from_numpy(flat(whole.view)), torch.from_numpy(points[:, 2]))))
+    there, camera = flat(half.view), half.view.camera
+    row, column = half.lidar.pixel.numpy() // camera.width, half.lidar.pixel.numpy() % camera.width
+    assert (camera.width, camera.height) == (120, 98)
+    apart = np.abs(np.stack([row - there // camera.width, column - there % camera.width]))
+    assert apart.max() <= (width != 240), "exact for even sides; in an odd one a pixel may lie across two"
+    assert torch.equal(half.lidar.depth_m, torch.from_numpy(points[:, 2]))
+
+
+def test_views_that_would_be_tiny_stay() -> None:
+    small = stored(300, 2 * LEAST_PX - 1)
+    assert halved(small) is small
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool) -> None:
+    sizes, virtual, recorded = HalvedViews(8, keep), stored(), stored(kind="recorded")
+    assert sizes.sized(virtual, 8).rgb.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert (sizes.sized(virtual, 8) is sizes.sized(virtual, 3)) == keep
+    assert sizes.sized(virtual, 9) is virtual
+    assert sizes.sized(recorded, 1) is recorded
