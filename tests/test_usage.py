@@ -1,5 +1,6 @@
 """What work takes: seconds, processor seconds, memory with child processes, bytes; over interrupted runs, too."""
 
+import os
 import platform
 import subprocess
 import sys
@@ -127,11 +128,11 @@ def test_memory_that_a_forked_process_has_not_changed_counts_once() -> None:
 def test_where_no_shares_are_told_resident_sizes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     text = usage.system_text
     monkeypatch.setattr(usage, "system_text", lambda path: "" if "smaps" in path else text(path))
-    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=-1)
-    sizes = usage.resident_sizes()
-    assert len(sizes) == 2
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=-1) as child:
+        sizes = usage.resident_sizes()
+        child.communicate(b"\n")
+    assert {os.getpid(), child.pid} <= set(sizes)  # with what other tests left running
     assert usage.held_bytes(sizes) == sum(size.all_bytes for size in sizes.values())
-    child.communicate(b"\n")
 
 
 @needs_proc
