@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Final
 
 import torch
 
+from mudg import native
 from mudg.base import log, memory, store
 from mudg.base.config import result_settings
 from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.palette import CLASSES
+from mudg.base.processes import computed_ahead
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Observation, Scene, Trajectory, View
 from mudg.core import trajectory
@@ -47,6 +51,10 @@ from mudg.stages.radiance.storage import load_field
 
 VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
 """Bytes per pixel that drawing a view needs at least: colour, depth, coverage and shares of the classes."""
+AHEAD_PIXELS: Final = 1_000_000
+"""Larger views are drawn one at a time by all threads: less memory."""
+Drawers = Callable[[Sequence[View]], AbstractContextManager[Iterator[Observation]]]
+"""Draws views in order."""
 _OUTPUT = VerbOutput("render", 2, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
@@ -101,14 +109,21 @@ def run(
                 followers.append(draw)
     paths = trajectories(loaded, config)
     _require_memory(paths)
+    threads = 1 if followers or device.type != "cpu" else native.threads()
     try:
-        with log.task(f"render {source}", sum(len(path) for path in paths)) as bar, memory_of(device, "render"):
+        with (
+            log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
+            memory_of(device, "render"), ThreadPoolExecutor(1) as encoder,
+        ):  # fmt: skip
+            videos = list[Future[None]]()
             for path in paths:
                 for follower in followers:
                     follower.follow(path)
-                _render_trajectory(draw, path, folder.path / path.name, source, bar)
+                _render_trajectory(_several(draw, threads), path, folder.path / path.name, source, bar)
                 if config.video:
-                    _write_video(folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps)
+                    videos.append(encoder.submit(_write_video, folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps))
+            for video in videos:
+                video.result()
     except KeyboardInterrupt:
         folder.pause()
         raise
@@ -215,18 +230,33 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     return tuple(paths)
 
 
-def _render_trajectory(draw: Drawer, path: Trajectory, out: Path, source: str, bar: log.ProgressTask) -> None:
+def _several(draw: Drawer, threads: int) -> Drawers:
+    """What draws views in order; small ones beforehand, in as many threads, so that a thread draws while another writes."""
+
+    def drawn(views: Sequence[View]) -> Generator[Observation, None, None]:
+        if threads == 1 or any(view.camera.width * view.camera.height > AHEAD_PIXELS for view in views):
+            yield from map(draw, views)
+            return
+        with native.one_thread():
+            yield from computed_ahead(lambda number: draw(views[number]), len(views), threads)
+
+    return lambda views: closing(drawn(views))
+
+
+def _render_trajectory(draw: Drawers, path: Trajectory, out: Path, source: str, bar: log.ProgressTask) -> None:
     """One folder of observations; views that an earlier, interrupted run wrote are kept."""
     if (out / "observations.json").is_file():
         bar.advance(len(path))
         return
     with ObservationWriter(out, path.name, source) as writer:
-        for index, view in enumerate(path.views):
-            if index < writer.done:
-                writer.skip(view)
-            else:
-                writer.add(draw(view))
+        kept = path.views[: writer.done]
+        for view in kept:
+            writer.skip(view)
             bar.advance()
+        with draw(path.views[len(kept) :]) as made:
+            for observation in made:
+                writer.add(observation)
+                bar.advance()
 
 
 def _write_video(observations: Path, path: Path, fps: float) -> None:
