@@ -70,3 +70,12 @@ def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool) -> None:
     assert (sizes.sized(virtual, 8) is sizes.sized(virtual, 3)) == keep
     assert sizes.sized(virtual, 9) is virtual
     assert sizes.sized(recorded, 1) is recorded
+
+
+def test_large_views_are_halved_at_every_step_unless_none_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mudg.stages.fitting.halved.WHOLE_PIXELS", WIDTH * HEIGHT - 1)
+    view = stored()
+    for until, side in ((10.0, WIDTH // 2), (0.0, WIDTH)):
+        sizes = HalvedViews(until, keep=True)
+        assert [sizes.sized(view, step).rgb.shape[1] for step in (1, 11)] == [side, side]
+    assert HalvedViews(10.0, keep=True).sized(stored(WIDTH - 1), 11).rgb.shape[1] == WIDTH - 1

@@ -21,7 +21,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -324,7 +324,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 start_unseen_gaussians(state, config, raster)
             views = next(upcoming)
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views]
+            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views][0]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
             state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
@@ -338,7 +338,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
 
             state.step, state.seconds = step, state.seconds + time.perf_counter() - began
             if step % 20 == 0 or step == config.iterations or densified:
-                state.last = _progress(state, views[0], *learnt[0])
+                state.last = _progress(state, views[0], *learnt)
                 folder.log(step=step, view=views[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
@@ -369,11 +369,18 @@ class LearnStep:
     first: bool
 
 
-def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Render, dict[str, Tensor]]:
+class LearntPicture(NamedTuple):
+    """What a step rendered: colours f32[3, H, W] without the sky, and coverage f32[1, H, W]."""
+
+    rgb: Tensor
+    alpha: Tensor
+
+
+def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[LearntPicture, dict[str, Tensor]]:
     """Render a view and add the gradients of its loss to the parameters'.
 
     Returns:
-        The picture, and the weighted loss terms.
+        The picture (not all that was rendered: that would stay in memory while the next view is), and the weighted loss terms.
     """
     config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
     recorded = view.kind == "recorded"
@@ -397,7 +404,7 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Rende
         camera = view.view.camera
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
         state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0], timed)
-    return render, terms
+    return LearntPicture(render.rgb.detach(), render.alpha.detach()), {name: term.detach() for name, term in terms.items()}
 
 
 def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
@@ -550,7 +557,7 @@ def save_checkpoint(state: FitState, folder: Path) -> None:
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
 
-def _progress(state: FitState, view: TrainView, render: Render, terms: Mapping[str, Tensor]) -> dict[str, float]:
+def _progress(state: FitState, view: TrainView, render: LearntPicture, terms: Mapping[str, Tensor]) -> dict[str, float]:
     with torch.no_grad():
         rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
         psnr = metrics.psnr(rgb, view.rgb, view.mask)

@@ -153,7 +153,8 @@ class VirtualConfig:
     the recorded path."""
     half_size: float = Field(default=0.8, ge=0, le=1)
     """Share of the iterations up to which virtual views are used at half their size, 0 to 1: faster, with little loss. 0: always at
-    full size. A fit that continues a finished one begins at 0.5."""
+    full size. A fit that continues a finished one begins at 0.5. Views above 2.5 million pixels are never used at full size,
+    except with 0."""
     gaussians: int = Field(default=8000, ge=0)
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
     densify: bool = False

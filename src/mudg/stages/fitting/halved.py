@@ -6,12 +6,14 @@ per pixel as it costs per Gaussian.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from mudg.core.pictures import resize_area, resize_nearest
+from mudg.models.featnets import WHOLE_PIXELS
 from mudg.stages.fitting.views import LidarPixels, StoredView
 
 LEAST_PX: Final = 96
@@ -19,9 +21,10 @@ LEAST_PX: Final = 96
 
 
 class HalvedViews:
-    """Gives the steps up to ``until`` virtual views at half their size.
+    """Gives the steps up to ``until`` virtual views at half their size; of views above ``WHOLE_PIXELS`` all steps, for want of memory.
 
     Args:
+        until: 0 leaves every view as it is.
         keep: halved views stay in memory, a quarter of what the views themselves take.
     """
 
@@ -31,7 +34,9 @@ class HalvedViews:
 
     def sized(self, view: StoredView, step: int) -> StoredView:
         """The view as a step is to see it."""
-        if view.kind == "recorded" or step > self._until:
+        height, width = view.rgb.shape[:2]
+        until = math.inf if self._until and height * width > WHOLE_PIXELS else self._until
+        if view.kind == "recorded" or step > until:
             return view
         if self._kept is None:
             return halved(view)
