@@ -1,4 +1,4 @@
-"""The street where an object is gone: hidden ground is closed, shadows are brightened, nothing else changes."""
+"""The street where an object is gone: what nobody saw goes, hidden ground is closed, shadows are brightened, nothing else changes."""
 
 from __future__ import annotations
 
@@ -12,96 +12,186 @@ from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
+from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.data.edits import parse_edits
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import CERTAINTY, SceneModel
-from mudg.models.scene.nodes import StaticNode
-from mudg.models.scene.uncovered import without_traces
+from mudg.models.scene.nodes import RigidNode, StaticNode
+from mudg.models.scene.shadows import continued, shaded_cells
+from mudg.models.scene.sky import SkyNode
+from mudg.models.scene.uncovered import SHOWN, Hidden, noted, shown_by, without_traces
 from mudg.stages.editing.apply import hidden_by
 from mudg.stages.editing.plan import Actor, EditSources, EditWorld, plan_edits
 
 SIZE = (4.0, 2.0, 1.5)
 CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-LIT, SHADED = 0.55, 0.4
+RASTER = RasterConfig(near_m=0.2)
+LIT, SHADED, CAR = 0.55, 0.3, 0.1
+CLASSES = (ID["road"], ID["building"], ID["car"])
 
 
-def lead() -> tuple[Actor, list[View]]:
-    """A car that drives 8 m ahead of the camera, 1.5 m per second along x."""
+def lead(step_m: float = 1.5) -> tuple[Actor, list[View]]:
+    """A car 8 m ahead of the camera; both drive ``step_m`` per second along x for a second."""
     times = np.arange(5) / 4
-    poses = np.stack([geometry.yaw_matrix(0.0, (8 + 1.5 * t, 0, 0.75)) for t in times])
-    views = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (1.5 * t, 0, 1.4)), float(t)) for t in times]
+    poses = np.stack([geometry.yaw_matrix(0.0, (8 + step_m * t, 0, 0.75)) for t in times])
+    views = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (step_m * t, 0, 1.4)), float(t)) for t in times]
     return Actor("car", SIZE, Motion.recorded(times, poses)), views
 
 
-def street(xy: np.ndarray, extra: np.ndarray) -> SceneModel:
-    """Level road, dark beside the car's path; ``extra`` f64[M, 3] are black Gaussians of a building."""
-    beside = (np.abs(xy[:, 1]) < 1.5) & (xy[:, 0] > 5.5) & (xy[:, 0] < 12)
-    grey = np.concatenate([np.where(beside, SHADED, LIT), np.zeros(len(extra))])
-    means = np.concatenate([np.column_stack([xy, np.zeros(len(xy))]), extra])
-    classes = torch.full((len(means), 2), -5.0)
-    classes[: len(xy), 0] = 5.0
-    classes[len(xy) :, 1] = 5.0
+def grid(*axes: tuple[float, float, float]) -> np.ndarray:
+    """Places f64[M, D] on a regular grid: begin, end and step of each axis."""
+    return np.stack(np.meshgrid(*(np.arange(*axis) for axis in axes), indexing="ij"), -1).reshape(-1, len(axes))
+
+
+def level(xy: np.ndarray) -> np.ndarray:
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+ROAD = level(grid((2, 30, 0.3), (-7, 7, 0.3)))
+
+
+def street(actor: Actor, road: np.ndarray, grey: np.ndarray, buildings: np.ndarray, spots: np.ndarray | None = None) -> SceneModel:
+    """Level road of given greys, white Gaussians of buildings, black ones of road users in the background, and the car: its rear, black."""
+    spots = np.zeros((0, 3)) if spots is None else spots
+    rear = np.column_stack([np.full(20 * 15, -2.0), grid((-0.95, 1, 0.1), (-0.7, 0.8, 0.1))])
+    means = np.concatenate([road, buildings, spots, rear])
+    owner = np.repeat([0, 0, 0, 1], [len(road), len(buildings), len(spots), len(rear)])
+    kind = np.repeat([0, 1, 2, 2], [len(road), len(buildings), len(spots), len(rear)])
+    greys = np.concatenate([grey, np.ones(len(buildings)), np.zeros(len(spots)), np.full(len(rear), CAR)])
+    classes = torch.full((len(means), 3), -5.0)
+    classes[torch.arange(len(means)), torch.from_numpy(kind)] = 5.0
     columns = {
         "means": torch.from_numpy(means.astype(np.float32)), "quats": torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
-        "log_scales": torch.full((len(means), 3), -2.0), "logits": torch.full((len(means),), 3.0),
-        "sh_dc": torch.from_numpy((grey - 0.5) / SH_C0).float()[:, None, None].repeat(1, 1, 3), "semantics": classes,
+        "log_scales": torch.full((len(means), 3), -2.0), "logits": torch.full((len(means),), 4.0),
+        "sh_dc": torch.from_numpy((greys - 0.5) / SH_C0).float()[:, None, None].repeat(1, 1, 3), "semantics": classes,
     }  # fmt: skip
-    labels = {"node": torch.zeros(len(means), dtype=torch.int32), CERTAINTY: torch.ones(len(means), dtype=torch.float16)}
-    return SceneModel(Table(columns, labels), (StaticNode(),), None, (ID["road"], ID["building"]), 0)
+    labels = {"node": torch.from_numpy(owner.astype(np.int32)), CERTAINTY: torch.ones(len(means), dtype=torch.float16)}
+    car = RigidNode("car", "car", list(SIZE), actor.motion.times_s, actor.motion.poses)
+    return SceneModel(Table(columns, labels), (StaticNode(), car), None, CLASSES, 0)
+
+
+def cleared(model: SceneModel, actor: Actor, views: list[View]) -> SceneModel:
+    """The street after the car was removed."""
+    known = noted(model, views, RASTER)
+    return without_traces(known.without_nodes(["car"]), {"car": hidden_by(actor, views)}, views, RASTER)
 
 
 def grey_of(model: SceneModel) -> np.ndarray:
     return 0.5 + SH_C0 * model.table["sh_dc"].detach().numpy()[:, 0, 0].astype(np.float64)
 
 
-def test_hidden_ground_is_closed() -> None:
-    xy = np.stack(np.meshgrid(np.arange(2, 30, 0.3), np.arange(-7, 7, 0.3), indexing="ij"), -1).reshape(-1, 2)
-    seen = (np.abs(xy[:, 1]) > 2.4) | (xy[:, 0] < 9)  # nobody saw the road ahead of the car
-    floaters = np.array([[9.0, 0.2, 0.9], [8.2, -0.4, 0.6]])
-    wall = np.array([[20.0, 5.0, 2.0], [8.0, 3.0, 1.0]])
-    model = street(xy[seen], np.concatenate([floaters, wall]))
+def means_of(model: SceneModel, class_name: str) -> np.ndarray:
+    rows = model.table["semantics"].detach().argmax(1).numpy() == CLASSES.index(ID[class_name])
+    return model.table["means"].detach().numpy()[rows]
+
+
+def made_up(model: SceneModel) -> np.ndarray:
+    return model.table.labels[CERTAINTY].numpy() == 0
+
+
+def same_places(found: np.ndarray, expected: np.ndarray) -> bool:
+    return {tuple(np.round(m, 3)) for m in found} == {tuple(np.round(m, 3)) for m in expected.astype(np.float32)}
+
+
+def test_what_views_show_of_a_gaussian() -> None:
     actor, views = lead()
-    made = without_traces(model, [hidden_by(actor, views)])
+    model = street(actor, ROAD, np.full(len(ROAD), LIT), np.array([[14.0, 0, 0.7]]))
+    wall = len(ROAD)
+    with_car, without = (shown_by(model, views[0], RASTER, absent)[0] for absent in ((), ("car",)))
+    assert with_car[wall] < 0.01 < 1 < without[wall]
+    assert torch.equal(without[wall + 1 :], torch.zeros(len(model.table) - wall - 1))
+    first, last, both = (noted(model, seen, RASTER).table.labels[SHOWN] for seen in (views[:1], views[-1:], [views[0], views[-1]]))
+    assert torch.equal(first, with_car) and torch.equal(both, torch.maximum(first, last)) and not torch.equal(first, last)
+
+
+def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
+    actor, views = lead()
+    unseen = np.abs(ROAD[:, 1]) < 0.12 * ROAD[:, 0] - 0.3
+    dark = np.where(unseen & (ROAD[:, 0] > 9), 0.0, LIT)  # what a fit left behind the car
+    behind, beside = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3)), np.array([[20.0, 6.0, 2.0], [12.0, 4.0, 1.0]])
+    in_path, around = np.array([[9.0, 0.2, 0.9]]), np.array([[10.0, 1.25, 0.6], [10.0, -3.0, 0.6]])
+    model = street(actor, ROAD, dark, np.concatenate([behind, beside, in_path]), around)
+    before = grey_of(model)
+    made = cleared(model, actor, views)
+    assert same_places(means_of(made, "building"), beside)
+    assert same_places(means_of(made, "car"), around[1:])  # the first is a part of the car that the box leaves out
+    new, means = made_up(made), made.table["means"].detach().numpy()
+    assert new.sum() > 50 and np.allclose(means[new, 2], 0, atol=0.05) and np.allclose(grey_of(made)[new], LIT, atol=0.02)
+    assert ((means[new, 0] > 13) & (np.abs(means[new, 1]) < 0.5)).any()  # the middle of what was hidden
+    assert np.allclose(grey_of(made)[~new & (np.abs(means[:, 1]) < 4) & (means[:, 2] < 0.1)], LIT, atol=1e-5)
+    assert SHOWN not in made.table.labels and np.array_equal(grey_of(model), before)  # the original stays
+
+
+def test_what_a_view_saw_stays() -> None:
+    actor, views = lead()
+    behind = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3))
+    model = street(actor, ROAD, np.full(len(ROAD), LIT), behind)
+    aside = View(CAMERA, geometry.from_rotation_translation(FORWARD, (6.0, -4.0, 3.0)), 0.0)
+    turned = replace(aside, world_from_cam=aside.world_from_cam @ geometry.from_rotation_translation(
+        geometry.yaw_matrix(0.0)[:3, :3], (0.0, 0, 0)))  # fmt: skip
+    made = cleared(model, actor, [*views, turned])
+    only = cleared(model, actor, views)
+    assert same_places(means_of(made, "building"), behind) and not len(means_of(only, "building"))
+    assert made_up(made).sum() < made_up(only).sum()
+
+
+@pytest.mark.parametrize(("step_m", "gone"), [(1.5, True), (0.0, True), (6.0, False)])
+def test_the_shadow_of_what_hardly_moves_becomes_as_bright_as_what_lies_around(step_m: float, gone: bool) -> None:
+    actor, views = lead(step_m)
+    shadow = (np.abs(ROAD[:, 1]) < 1.1) & (ROAD[:, 0] > 4.4) & (ROAD[:, 0] < 10 + step_m)
+    other = (ROAD[:, 1] > 4) & (ROAD[:, 0] < 12)  # of something else
+    model = street(actor, ROAD, np.where(shadow | other, SHADED, LIT), np.zeros((0, 3)))
+    made = cleared(model, actor, views)
+    means, kept = made.table["means"].detach().numpy(), ~made_up(made)
+    near = kept & (np.abs(means[:, 1]) < 0.9) & (means[:, 0] > 4.6) & (means[:, 0] < 5.8) & (means[:, 2] < 0.1)
+    assert near.sum() > 10
+    assert np.median(grey_of(made)[near]) == pytest.approx(LIT if gone else SHADED, abs=0.02)
+    far = kept & (means[:, 1] > 4.3) & (means[:, 0] < 11)
+    assert far.sum() > 10 and np.allclose(grey_of(made)[far], SHADED, atol=1e-5)
+
+
+def test_bright_ground_is_never_darkened() -> None:
+    actor, views = lead()
+    bright = np.where(np.abs(ROAD[:, 1]) < 1.5, 0.9, LIT)
+    made = cleared(street(actor, ROAD, bright, np.zeros((0, 3))), actor, views)
+    assert np.all(grey_of(made)[~made_up(made)] >= LIT - 1e-6)
+
+
+def test_a_shadow_may_reach_ground_that_no_view_shows() -> None:
+    actor, views = lead()
+    shadow = (np.abs(ROAD[:, 1]) < 1.1) & (ROAD[:, 0] < 12)  # the camera sees the road from 3.2 m on
+    made = cleared(street(actor, ROAD, np.where(shadow, SHADED, LIT), np.zeros((0, 3))), actor, views)
     means, grey = made.table["means"].detach().numpy(), grey_of(made)
-    buildings = made.table["semantics"].detach().argmax(1).numpy() == 1
-    assert {tuple(np.round(m, 3)) for m in means[buildings]} == {tuple(np.round(w, 3)) for w in wall.astype(np.float32)}
-    new = made.table.labels[CERTAINTY].numpy() == 0
-    assert new.sum() > 50 and np.allclose(means[new, 2], 0, atol=1e-6)
-    inside = means[new, :2]
-    assert inside[:, 0].min() > 7 and np.abs(inside[:, 1]).max() < 6
-    assert ((inside[:, 0] > 13) & (np.abs(inside[:, 1]) < 0.5)).any()  # the middle of what was hidden
-    far = ~new & ~buildings & (np.abs(means[:, 1]) > 2.5)
-    assert np.allclose(grey[far], LIT, atol=1e-6)
-    assert np.array_equal(grey_of(model), grey_of(street(xy[seen], np.concatenate([floaters, wall]))))  # the original stays
+    assert np.isfinite(grey).all()
+    near = ~made_up(made) & (np.abs(means[:, 1]) < 0.9) & (means[:, 0] < 6)
+    assert np.allclose(grey[near & (means[:, 0] > 3.5)], LIT, atol=0.05) and (grey[near] >= SHADED - 1e-6).all()
 
 
-def test_the_shadow_of_what_stands_becomes_as_bright_as_what_lies_around() -> None:
-    xy = np.stack(np.meshgrid(np.arange(2, 30, 0.3), np.arange(-7, 7, 0.3), indexing="ij"), -1).reshape(-1, 2)
-    model, (actor, views) = street(xy, np.zeros((0, 3))), lead()
-    hidden = hidden_by(actor, views)
-    for moves in (False, True):
-        made = without_traces(model, [replace(hidden, moves=moves)])
-        means, kept = made.table["means"].detach().numpy(), made.table.labels[CERTAINTY].numpy() > 0
-        near = kept & (np.abs(means[:, 1]) < 1.4) & (means[:, 0] > 6) & (means[:, 0] < 7.2)
-        assert near.sum() > 10 and np.median(grey_of(made)[near]) == pytest.approx(SHADED if moves else LIT, abs=0.01)
+def test_a_shadow_lies_behind_what_throws_it() -> None:
+    light = np.full((60, 60), 0.3)
+    below = np.zeros((60, 60), bool)
+    below[26:34, 28:32] = True
+    shadow = np.zeros((60, 60), bool)
+    shadow[20:34, 28:32] = True
+    light[shadow] = 0.05
+    light[20:50, 38:44] = 0.05  # a dark strip beside: of something else
+    light[below & (np.indices(below.shape)[0] > 31)] = np.nan  # not known
+    found = shaded_cells(light, below, 3.0)
+    assert np.array_equal(found, shadow & np.isfinite(light))
+    assert not shaded_cells(np.full((60, 60), 0.3), below, 3.0).any()
 
 
-def test_lit_ground_is_never_darkened_and_what_is_seen_is_not_replaced() -> None:
-    xy = np.stack(np.meshgrid(np.arange(2, 30, 0.3), np.arange(-7, 7, 0.3), indexing="ij"), -1).reshape(-1, 2)
-    model = street(xy, np.zeros((0, 3)))
-    bright = model.table["sh_dc"].detach().clone()
-    bright[model.table["means"].detach()[:, 1].abs() < 1.5] = (0.9 - 0.5) / SH_C0
-    table = Table({**{k: v.detach() for k, v in model.table.columns.items()}, "sh_dc": bright}, dict(model.table.labels))
-    model = SceneModel(table, model.nodes, None, model.classes, 0)
-    actor, views = lead()
-    aside = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (v.center_world[0], 6.0, 4.0)), v.time_s) for v in views]
-    made = without_traces(model, [hidden_by(actor, views + aside)])
-    assert np.all(grey_of(made)[made.table.labels[CERTAINTY].numpy() > 0] >= LIT - 1e-6)
-    only = without_traces(model, [hidden_by(actor, views)])
-    count = [int((m.table.labels[CERTAINTY] == 0).sum()) for m in (made, only)]
-    assert count[0] < count[1]  # a camera that looks over the car leaves less to guess
+def test_colours_continue_without_markings() -> None:
+    places = grid((-6, 6.1, 0.2), (-6, 6.1, 0.2))
+    places = places[np.abs(places).max(1) > 1.5]
+    colors = np.repeat(0.4 + 0.01 * places[:, :1], 3, 1)
+    marking = np.abs(places[:, 1] - 2) < 0.3
+    colors[marking] = 0.95
+    found, near = continued(np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0]]), places, colors, np.ones(len(places)))
+    assert found[0] == pytest.approx(0.4, abs=0.005) and found[2, 0] < found[0, 0] < found[1, 0]
+    assert np.abs(places[near[0]]).max() == pytest.approx(1.6)
 
 
 def test_a_script_says_whose_traces_go() -> None:
@@ -113,8 +203,26 @@ def test_a_script_says_whose_traces_go() -> None:
             assert plan.closed == ({"a"} if asked else set())
 
 
-def test_a_scene_without_ground_or_views_stays() -> None:
-    model = street(np.zeros((4, 2)), np.zeros((0, 3)))
+def test_sky_that_the_car_always_hid_continues_the_sky_that_was_seen() -> None:
     actor, views = lead()
-    assert without_traces(model, [hidden_by(actor, views)]) is model
-    assert without_traces(model, [hidden_by(actor, [])]) is model
+    views = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5)), v.time_s) for v in views]
+    model = replace(street(actor, ROAD, np.full(len(ROAD), LIT), np.zeros((0, 3))), sky=SkyNode.uniform(64, (0.5, 0.6, 0.9)))
+    assert model.sky is not None
+    with torch.no_grad():
+        model.sky.table["panorama"][:, :, 30:32, 62:66] = 0.0  # ahead, up to 6 degrees above the horizon
+        model.sky.table["panorama"][:, :, :20] = 0.2
+    made = cleared(model, actor, views)
+    assert made.sky is not None and not made.sky.table.labels
+    found, before = made.sky.table["panorama"].detach(), model.sky.table["panorama"].detach()
+    assert torch.allclose(found[0, :, 30:32, 62:66], torch.tensor([0.5, 0.6, 0.9])[:, None, None].expand(3, 2, 4))
+    assert torch.equal(found[:, :, :29], before[:, :, :29])
+
+
+def test_a_scene_without_ground_or_views_stays() -> None:
+    actor, views = lead()
+    for road, seen in ((np.zeros((4, 3)), views), (ROAD, [])):
+        hidden = {"car": hidden_by(actor, seen)}
+        model = noted(street(actor, road, np.full(len(road), LIT), np.zeros((0, 3))), seen, RASTER)
+        made = without_traces(model, hidden, seen, RASTER)
+        assert len(made.table) == len(model.table) and torch.equal(made.table["sh_dc"], model.table["sh_dc"])
+    assert isinstance(hidden_by(actor, []), Hidden)

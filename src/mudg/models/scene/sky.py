@@ -103,12 +103,18 @@ class SkyNode:
         if not count.any():
             return
         mean = total / np.maximum(count, 1)
-        seen = (count > 0).reshape(rows, columns)
-        tiled = np.concatenate([seen, seen, seen], 1)  # longitude wraps round
-        nearest = distance_transform_edt(~tiled, return_distances=False, return_indices=True)
-        rows_of, columns_of = nearest[0][:, columns : 2 * columns], nearest[1][:, columns : 2 * columns] % columns
+        rows_of, columns_of = _nearest((count > 0).reshape(rows, columns))
         filled = mean.reshape(3, rows, columns)[:, rows_of, columns_of]
         self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
+
+    def continued(self, unknown: NDArray[np.bool_], seen: NDArray[np.bool_]) -> SkyNode:
+        """The same sky with unknown texels bool[Hs, 2 Hs] in the colour of the nearest seen one; itself where none is."""
+        if not unknown.any() or not seen.any():
+            return self
+        rows_of, columns_of = (torch.from_numpy(index).to(self.table.device) for index in _nearest(seen))
+        panorama = self.table["panorama"].detach()
+        chosen = torch.from_numpy(unknown).to(panorama.device)
+        return SkyNode(Table({"panorama": torch.where(chosen, panorama[:, :, rows_of, columns_of], panorama)}))
 
     def to(self, device: torch.device) -> SkyNode:
         """The same sky on a device."""
@@ -122,3 +128,11 @@ class SkyNode:
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SkyNode:
         """Inverse of ``state``."""
         return cls(Table.from_state(tensors))
+
+
+def _nearest(seen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column i64[H, W] of the nearest texel that was seen; longitude wraps round."""
+    columns = seen.shape[1]
+    nearest = distance_transform_edt(~np.tile(seen, 3), return_distances=False, return_indices=True)
+    middle = np.asarray(nearest, np.int64)[:, :, columns : 2 * columns]
+    return middle[0], middle[1] % columns

@@ -24,8 +24,9 @@ from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.models.scene.sky import SkyNode
-from mudg.models.scene.uncovered import MOST_VIEWS, Hidden, without_traces
+from mudg.models.scene.uncovered import MOST_VIEWS, Hidden, noted, without_traces
 from mudg.stages.editing.plan import Actor, Background, EditPlan
+from mudg.stages.fitting.rendering import raster_of
 
 EGO_FACT: Final = "edited_ego"
 """Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
@@ -42,10 +43,13 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
     without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
     for name in without_nodes if plan.background is None else ():  # else it is gone with the street
         model = _cut_out(model, name, plan)
-    model = model.without_nodes([name for name in plan.removed if name in model.node_names()])
-    if plan.background is None:
-        gone = sorted(name for name in plan.closed if name in plan.before.actors)
-        model = without_traces(model, [hidden_by(plan.before.actors[name], plan.views) for name in gone])
+    closed = {name: plan.before.actors[name] for name in sorted(plan.closed & set(plan.before.actors)) if plan.background is None}
+    removed = [name for name in plan.removed if name in model.node_names()]
+    model = model.without_nodes([name for name in removed if name not in closed])
+    if closed:
+        hidden, views = {name: hidden_by(actor, plan.views) for name, actor in closed.items()}, spread(plan.views)
+        model = noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
+        model = without_traces(model, hidden, views, raster_of(model))
     if plan.background is not None:
         other, pose = plan.background
         model = edited.with_background(model, other.model, pose)
@@ -64,17 +68,16 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> 
     return model
 
 
+def spread(views: Sequence[View]) -> list[View]:
+    """At most `MOST_VIEWS` of some views, evenly."""
+    which = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
+    return [views[int(index)] for index in which] if views else []
+
+
 def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
-    """What recorded views say of the street around an object; at most `MOST_VIEWS` of them, spread over the drive."""
+    """An object and the views at whose times it is there, at most `MOST_VIEWS`."""
     there = sorted((view for view in views if actor.motion.pose_at(view.time_s) is not None), key=lambda view: view.time_s)
-    which = np.unique(np.linspace(0, len(there) - 1, min(MOST_VIEWS, len(there))).round().astype(int))
-    chosen = [there[int(index)] for index in which] if there else []
-    slopes = [[v.camera.width / (2 * v.camera.fx), v.camera.height / (2 * v.camera.fy)] for v in chosen]
-    poses = [pose for v in chosen if (pose := actor.motion.pose_at(v.time_s)) is not None]
-    shows = [geometry.invert(v.world_from_cam) for v in chosen]
-    return Hidden(
-        actor.size_m, np.array(poses), np.array([v.center_world for v in chosen]), np.array(shows), np.array(slopes), actor.moves
-    )
+    return Hidden(actor.size_m, actor.motion, actor.moves, tuple(spread(there)))
 
 
 def _cut_out(model: SceneModel, name: str, plan: EditPlan) -> SceneModel:
