@@ -163,8 +163,8 @@ def _drawn(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
 
 
 def _psnr(errors: list[NDArray[np.float32]]) -> float | None:
-    every = torch.from_numpy(np.concatenate(errors).astype(np.float64))
-    return float(metrics.psnr(every, torch.zeros_like(every))) if len(every) else None
+    every = torch.from_numpy(np.concatenate(errors))
+    return metrics.psnr_of_errors(every) if len(every) else None
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

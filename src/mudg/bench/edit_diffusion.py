@@ -156,8 +156,8 @@ def scores(case: EditCase, truth: CityWorld, draws: tuple[Draw, Draw]) -> dict[s
 
 
 def _psnr(errors: list[NDArray[np.float32]]) -> float | None:
-    every = torch.from_numpy(np.concatenate(errors).astype(np.float64))
-    return float(metrics.psnr(every, torch.zeros_like(every))) if len(every) else None
+    every = torch.from_numpy(np.concatenate(errors))
+    return metrics.psnr_of_errors(every) if len(every) else None
 
 
 def _distance(codec: CodecFeatures, pair: Sequence[NDArray[np.float32]], mask: NDArray[np.bool_]) -> float:

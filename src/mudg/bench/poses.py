@@ -195,8 +195,7 @@ def moving_psnr(scene: Scene, model: SceneModel) -> float:
         moving = torch.from_numpy(read_label(scene, frame, "dynamic").astype(bool))
         truth = torch.from_numpy(read_image(scene, frame)).permute(2, 0, 1).float() / 255
         errors.append((fit.render_view(model, frame.view, raster_of(model)).rgb - truth)[:, moving].flatten())
-    every = torch.cat(errors) if errors else torch.zeros(0)
-    return metrics.psnr(every, torch.zeros_like(every)) if len(every) else float("nan")
+    return metrics.psnr_of_errors(torch.cat(errors) if errors else torch.zeros(0))
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -64,6 +64,14 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
     return math.inf if error == 0 else -10.0 * math.log10(error)
 
 
+def psnr_of_errors(errors: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB from differences, of any sign, of values in [0, 1]; infinity without any, NaN of nothing."""
+    if errors.numel() == 0:
+        return math.nan
+    error = sum(float(piece.double().square().sum()) for piece in pieces_of(errors)) / errors.numel()
+    return math.inf if error == 0 else -10.0 * math.log10(error)
+
+
 def ssim(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     """Structural similarity (Wang 2004: 11x11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2), zero padding.
 
