@@ -12,7 +12,7 @@ import torch
 from fit_settings import fit_config
 from toy_world import fused_cloud, write_scene
 
-from mudg.base import store
+from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.bench import edit_runs
 from mudg.bench import run as bench
@@ -60,6 +60,15 @@ def test_the_lead_vehicle_is_taken_away(case: RunCase) -> None:
     assert row["overlap"] is None and row["overlap_before"] > 0.3
     assert row["uncovered"] > 0 and row["outside"] < 0.05
     assert abs(row["lidar"] - row["lidar_before"]) < 0.1 * row["lidar_before"]
+
+
+def test_a_vehicle_ahead_is_preferred_to_a_larger_one_beside(case: RunCase) -> None:
+    view, car = case.frames[0].view, case.scene.track("car")
+    pose = car.pose_at(view.time_s)
+    assert pose is not None and edit_runs._is_ahead(car, view)
+    beside, behind = (geometry.yaw_matrix(0.0, shift) @ pose for shift in ((0.0, 5.0, 0.0), (-20.0, 0.0, 0.0)))
+    for other in (beside, behind):
+        assert not edit_runs._is_ahead(replace(car, world_from_object=np.stack([other] * len(car.times_s))), view)
 
 
 def test_a_moved_vehicle_is_in_its_box_and_a_crash_is_counted(case: RunCase) -> None:

@@ -1,7 +1,7 @@
 """``mudg bench edit RUN ...``: edits of recorded drives, of which no truth exists, by measures that need none.
 
-On every finished ``mudg run``, seen by its front camera on the recorded path, the moving vehicle that shows the most pixels ahead is taken away
-and moved, a vehicle of the next run is put in, and fog and dusk come. Every render is compared with that of the unedited fit:
+On every finished ``mudg run``, seen by its front camera on the recorded path, the moving vehicle ahead that shows the most pixels is taken
+away and moved, a vehicle of the next run is put in, and fog and dusk come. Every render is compared with that of the unedited fit:
 
     warp       mean absolute colour difference, [0, 1], of a surface between neighbouring frames, carried by the depth and the poses of
                the rendered scene (the edited vehicle by its path); lower is steadier. Beside it that of the unedited video
