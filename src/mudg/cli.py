@@ -381,6 +381,7 @@ VERBS: dict[str, Verb] = {
     "bench": Verb(
         "Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.",
         ("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
+         "mudg bench edit runs/a runs/b --out runs/edited",
          "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
          "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
          "mudg bench paper city:reported --table mudg1 --out runs/mudg1"),

@@ -365,7 +365,7 @@ class Bench(Output):
     the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="[LOG ...]")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
-    generated cities."""
+    generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities."""
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
 
 

@@ -263,7 +263,8 @@ def bench(
     """Run a benchmark; returns the folder of ``bench.json``.
 
     Args:
-        name: ``mdm``, ``poses``, ``edit`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``.
+        name: ``mdm``, ``poses``, ``edit`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``; finished
+            runs, for ``edit``.
     """
     from mudg.bench import run as stage
 

@@ -131,7 +131,7 @@ def row_of(case: EditCase, name: str, text: str) -> dict[str, Any]:
         far = np.logical_not(ndimage.binary_dilation(mask, iterations=NEARBY_PX))
         outside.append((np.abs(made - usual).max(-1) > SAME)[far])
         for row, seen, model in ((0, now, edited), (1, then, case.model)):
-            there, drawn = seen.instance == instance, _drawn(model, case.name, frame.view)
+            there, drawn = seen.instance == instance, drawn_pixels(model, case.name, frame.view)
             counts[row] += (there & drawn).sum(), (there | drawn).sum()
     overlaps = [float(a / b) if b else None for a, b in counts]
     return {
@@ -151,7 +151,7 @@ def _rendered(model: SceneModel, view: View) -> NDArray[np.float32]:
     return render_view(model, view, raster_of(model)).rgb.permute(1, 2, 0).numpy()
 
 
-def _drawn(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
+def drawn_pixels(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
     """Pixels bool[H, W] of which an object's Gaussians make more than half."""
     if name not in model.node_names():
         return np.zeros((view.camera.height, view.camera.width), bool)

@@ -3,7 +3,8 @@
 mdm            the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
                without given classes, at several numbers of steps, and the seam between windows of a longer video
 poses          how much of the error of tracked boxes a fit takes out (see `bench_poses`); needs no diffusion model
-edit           edits of a fitted scene against the city regenerated with them (see `bench_edit`); needs no diffusion model
+edit           edits of a fitted scene against the city regenerated with them (see `bench_edit`); needs no diffusion model. Of
+               finished runs that are given: edits of recorded drives by measures that need no truth (see `bench_edit_runs`)
 shift          whole methods beside the recorded path, on lists of logs (see `bench_shift`, which has its own folders)
 real           whole methods on real logs, against what the methods did not see of them (see `bench_real`; own folders, too)
 paper          a table of a paper, on generated cities or real logs (see `bench_paper`; own folders, too)
@@ -27,7 +28,7 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.bench import edit_diffusion
+from mudg.bench import edit_diffusion, edit_runs
 from mudg.bench import paper as bench_paper
 from mudg.bench import poses as bench_poses
 from mudg.bench import real as bench_real
@@ -46,7 +47,7 @@ from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.synthesize import windows
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
-SHIFT, REAL, PAPER = "shift", "real", "paper"
+EDIT, SHIFT, REAL, PAPER = "edit", "shift", "real", "paper"
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 
 
@@ -54,7 +55,7 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
     """Run one of `BENCHES`, shift, real or paper; returns the folder with `bench.json` and `bench.md`.
 
     Args:
-        sources: logs, for real; logs or a list of cities, for paper.
+        sources: logs, for real; logs or a list of cities, for paper; finished runs, for edit.
 
     Raises:
         UsageError: there is no such benchmark, or logs were given to one that makes its own.
@@ -63,6 +64,8 @@ def run(name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = 
         return bench_paper.run(config, sources, out, overwrite=overwrite)
     if name == REAL:
         return bench_real.run(config, sources, out, overwrite=overwrite)
+    if name == EDIT and sources:
+        return edit_runs.run(config, sources, out, overwrite=overwrite)
     if sources:
         raise UsageError("this benchmark makes its own logs", where=f"mudg bench {name}", got=", ".join(map(str, sources)))
     if name == SHIFT:  # made of verbs that each keep their own folder
@@ -165,6 +168,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
     "poses": bench_poses.measure,
-    "edit": edit_diffusion.with_diffusion,
+    EDIT: edit_diffusion.with_diffusion,
 }
 """Every measurement that is one folder, by name."""

@@ -177,7 +177,7 @@ def _pose(actor: Actor | None, time_s: float) -> NDArray[np.float64] | None:
 
 def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     """Bool[H, W]: inside the outline of a box, grown a little."""
-    return _outlines(view, [(pose, size + BOX_GROWTH_M) for pose, size in boxes])
+    return outlines(view, [(pose, size + BOX_GROWTH_M) for pose, size in boxes])
 
 
 def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArray[np.bool_]:
@@ -188,10 +188,11 @@ def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArra
         about_m = 2 * reach * size[2]
         flat = pose @ geometry.yaw_matrix(0.0, (0.0, 0.0, -size[2] / 2))
         slabs.append((flat, np.array([size[0] + about_m, size[1] + about_m, SLAB_M])))
-    return _outlines(view, slabs)
+    return outlines(view, slabs)
 
 
-def _outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
+def outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
+    """Bool[H, W]: inside the outline of a box."""
     covered = np.zeros((view.camera.height, view.camera.width), bool)
     for pose, size in boxes:
         hull = geometry.box_hull(view, pose, size)  # of what lies ahead: a box beside the camera does not cover the whole image

@@ -1,0 +1,173 @@
+"""``mudg bench edit RUN ...``: edits of recorded drives by measures that need no truth. A small street stands for a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fit_settings import fit_config
+from toy_world import fused_cloud, write_scene
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, UsageError
+from mudg.bench import edit_runs
+from mudg.bench import run as bench
+from mudg.bench.edit_runs_measure import RunCase, measured
+from mudg.core import edit_scores
+from mudg.data.cloudfile import write_fused
+from mudg.data.edits import parse_edits
+from mudg.stages import annotate, fit, fuse, ingest
+from mudg.stages.config import AnnotateConfig, BenchConfig, FuseConfig, IngestConfig
+from mudg.stages.editing.runs import find_run
+from mudg.stages.fitting.storage import load_model, save_model
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like that of ``mudg run``, of a car that drives ahead."""
+    root = tmp_path_factory.mktemp("log") / "street"
+    write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
+    write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
+    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
+    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    return root
+
+
+@pytest.fixture(scope="module")
+def case(run: Path) -> RunCase:
+    return edit_runs.case_of("street", find_run(run), torch.device("cpu"))
+
+
+def test_an_edit_that_does_nothing_changes_nothing(case: RunCase) -> None:
+    seen: list[bool] = []
+    row = measured(case, parse_edits("- move: {id: car, along_m: 0, ground: false}", "nothing"),
+                   lambda _, old, new: seen.append(torch.equal(old.rgb, new.rgb)))  # fmt: skip
+    assert seen == [True] * FRAMES and row["outside"] == 0.0
+    assert row["warp"] == row["warp_before"] > 0 and row["lidar"] == row["lidar_before"] > 0
+    assert row["overlap"] == row["overlap_before"] > 0.3
+    assert row["uncovered"] is None and row["structure"] is None and (row["collisions"], row["warnings"]) == (0, 0)
+
+
+def test_the_lead_vehicle_is_taken_away(case: RunCase) -> None:
+    assert case.lead == "car"
+    row = measured(case, parse_edits("- remove: {ids: [car]}", "remove"))
+    assert row["overlap"] is None and row["overlap_before"] > 0.3
+    assert row["uncovered"] > 0 and row["outside"] < 0.05
+    assert abs(row["lidar"] - row["lidar_before"]) < 0.1 * row["lidar_before"]
+
+
+def test_a_vehicle_ahead_is_preferred_to_a_larger_one_beside(case: RunCase) -> None:
+    view, car = case.frames[0].view, case.scene.track("car")
+    pose = car.pose_at(view.time_s)
+    assert pose is not None and edit_runs._is_ahead(car, view)
+    beside, behind = (geometry.yaw_matrix(0.0, shift) @ pose for shift in ((0.0, 5.0, 0.0), (-20.0, 0.0, 0.0)))
+    for other in (beside, behind):
+        assert not edit_runs._is_ahead(replace(car, world_from_object=np.stack([other] * len(car.times_s))), view)
+
+
+def test_a_moved_vehicle_is_in_its_box_and_a_crash_is_counted(case: RunCase) -> None:
+    moved = measured(case, parse_edits("- move: {id: car, along_m: 3}", "move"))
+    assert abs(moved["overlap"] - moved["overlap_before"]) < 0.15 and moved["collisions"] == 0
+    crash = measured(case, parse_edits("- move: {id: car, along_m: -8, left_m: 1.9}", "crash"))
+    assert crash["collisions"] == 1 and crash["warnings"] >= 1 and "overlap" in crash["notes"][0]
+
+
+def test_fog_keeps_depth_and_loses_edges_with_its_density(case: RunCase) -> None:
+    rows = [measured(case, parse_edits(f"- weather: {{fog: {{visibility_m: {far}}}}}", "fog")) for far in (1000, 30)]
+    assert all(row["lidar"] == row["lidar_before"] and row["outside"] is None for row in rows)
+    assert 1 > rows[0]["structure"] > rows[1]["structure"] > 0
+
+
+def test_gradients_agree_under_another_exposure_and_not_with_the_negative() -> None:
+    image = torch.from_numpy(np.random.default_rng(0).random((3, 12, 16), np.float32))
+    assert edit_scores.gradient_correlation(0.5 * image + 0.1, image) == pytest.approx(1)
+    assert edit_scores.gradient_correlation(1 - image, image) == pytest.approx(-1)
+    assert edit_scores.gradient_correlation(torch.zeros_like(image), image) is None
+
+
+def test_one_step_of_a_byte_is_no_change_and_two_are() -> None:
+    image = torch.full((3, 2, 2), 0.5)
+    other = image.clone()
+    other[0, 0, 0] += 1 / 255
+    other[2, 1, 1] -= 2 / 255
+    assert edit_scores.changed_pixels(other, image).tolist() == [[False, False], [False, True]]
+
+
+def test_masks_are_counted_in_both_and_in_either() -> None:
+    a, b = np.eye(3, dtype=bool), np.zeros((3, 3), bool)
+    b[0] = True
+    assert edit_scores.mask_counts(a, b) == (1, 5)
+
+
+def test_two_drives_give_a_table_a_page_and_resume(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    other.symlink_to(run)
+    monkeypatch.setattr(edit_runs, "EDITS", {name: edit_runs.EDITS[name] for name in ("move 1 m left", "insert")})
+    out, rounds = tmp_path / "out", []
+    inner = edit_runs.measured
+
+    def stopped(*given: object) -> dict[str, object]:
+        rounds.append(given)
+        if len(rounds) == 2:
+            raise KeyboardInterrupt
+        return inner(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(edit_runs, "measured", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        bench.run("edit", BenchConfig(device="cpu"), out, sources=[run, other])
+    bench.run("edit", BenchConfig(device="cpu"), out, sources=[run, other])
+    assert len(rounds) == 5  # the row that was finished was not measured again
+    doc = store.read_json(out / "bench.json")
+    assert [(row["run"], row["edit"], row["given_by"]) for row in doc["rows"]] == [
+        ("street", "move 1 m left", None), ("street", "insert", "other"), ("other", "move 1 m left", None), ("other", "insert", "street"),
+    ]  # fmt: skip
+    assert doc["rows"][1]["overlap"] > 0.3 and doc["rows"][1]["overlap_before"] == doc["rows"][0]["overlap_before"]
+    page, text = (out / "page.html").read_text(), (out / "bench.md").read_text()
+    assert page.count("<img ") == 4 * 2 * 3 and "http" not in page.split("<main")[1] and text.count("\n| street |") == 2
+    bench.run("edit", BenchConfig(device="cpu"), out, sources=[run, other])
+    assert len(rounds) == 5
+
+
+def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no fitted scene"):
+        bench.run("edit", BenchConfig(), tmp_path / "a", sources=[tmp_path / "nothing"])
+    with pytest.raises(InputError, match="of a fit alone"):
+        bench.run("edit", BenchConfig(), tmp_path / "a", sources=[run / "fit" / "street_gaussians"])
+    with pytest.raises(UsageError, match="harmonize"):
+        bench.run("edit", BenchConfig(harmonize=True), tmp_path / "a", sources=[run])
+    assert not (tmp_path / "a").exists()
+    bare = tmp_path / "bare"
+    for part in ("scene", "fuse"):
+        (bare / part).parent.mkdir(exist_ok=True)
+        (bare / part).symlink_to(run / part)
+    model = load_model(run / "fit" / "street_gaussians")
+    parts = find_run(run)
+    save_model(replace(model, classes=()), bare / "fit" / "street_gaussians")
+    with pytest.raises(InputError, match="without labels"):
+        edit_runs.case_of("bare", find_run(bare), torch.device("cpu"))
+    scene = edit_runs.case_of("street", parts, torch.device("cpu"))
+    with pytest.raises(InputError, match="no vehicle moves"):
+        edit_runs.lead_of(scene.scene, replace(model, nodes=model.nodes[:1]), scene.frames, scene.points)
+
+
+@pytest.mark.slow
+def test_a_recorded_drive(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    root = tmp_path / "kitti"
+    ingest.run(IngestConfig(resolution="320", contact_sheet=False), shared_data("kitti_2011_09_26"), tmp_path / "raw")
+    annotate.run(AnnotateConfig(), tmp_path / "raw", root / "scene")
+    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
+    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    out = bench.run("edit", BenchConfig(), tmp_path / "out", sources=[root])
+    rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
+    assert rows["remove"]["object"] == "0" and rows["remove"]["outside"] < 0.03
+    assert rows["fog"]["lidar"] == rows["fog"]["lidar_before"] and 0 < rows["dusk"]["structure"] < 1
+    assert all(row["warp"] < 0.2 for row in rows.values()) and rows["move 3 m ahead"]["overlap"] > 0.3
