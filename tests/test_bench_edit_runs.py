@@ -18,6 +18,7 @@ from mudg.bench import edit_runs
 from mudg.bench import run as bench
 from mudg.bench.edit_runs_measure import RunCase, measured
 from mudg.core import edit_scores
+from mudg.core.table import Table
 from mudg.data.cloudfile import write_fused
 from mudg.data.edits import parse_edits
 from mudg.stages import annotate, fit, fuse, ingest
@@ -60,6 +61,20 @@ def test_the_lead_vehicle_is_taken_away(case: RunCase) -> None:
     assert row["overlap"] is None and row["overlap_before"] > 0.3
     assert row["uncovered"] > 0 and row["outside"] < 0.05
     assert abs(row["lidar"] - row["lidar_before"]) < 0.1 * row["lidar_before"]
+    closed = measured(case, parse_edits("- remove: {ids: [car], close_street: true}", "closed"))
+    assert closed["overlap"] is None and closed["uncovered_psnr"] is not None
+
+
+def test_colours_that_no_photograph_shows_behind_the_vehicle_are_errors(case: RunCase) -> None:
+    script = parse_edits("- remove: {ids: [car]}", "remove")
+    table = case.model.table
+    still = (table.labels["node"] == 0)[:, None, None]
+    painted = {**{name: value.detach() for name, value in table.columns.items()}}
+    painted["sh_dc"] = torch.where(still, -painted["sh_dc"], painted["sh_dc"])
+    negative = replace(case.model, table=Table(painted, dict(table.labels)))
+    right, wrong = (measured(replace(case, model=model), script) for model in (case.model, negative))
+    assert right["uncovered_psnr"] > wrong["uncovered_psnr"] + 2
+    assert right["uncovered"] == wrong["uncovered"]
 
 
 def test_a_vehicle_ahead_is_preferred_to_a_larger_one_beside(case: RunCase) -> None:

@@ -8,7 +8,8 @@ away and moved, a vehicle of the next run is put in, and fog and dusk come. Ever
     outside    share of the pixels away from the edit that change by more than 1/255, [0, 1]; lower is better (not for weather and light)
     structure  correlation of luminance gradients with the unedited render, [-1, 1]; higher is better (weather and light alone)
     lidar      AbsRel, 0 and up, of rendered depth at the LiDAR points of the moment away from the edit, with the edit and without
-    uncovered  AbsRel in the pixels that showed the vehicle and do not any more, at static points of the sweeps around; lower is better
+    uncovered  AbsRel in the pixels that showed the vehicle and do not any more, at static points of the sweeps around; lower is better.
+               PSNR, dB, of the render's colours there against those that recorded frames show at these points when nothing hides them
     overlap    intersection over union of the vehicle's pixels with the outline of its box, [0, 1], at the new place and at the old one
     collisions, warnings   numbers of what ``mudg edit`` reports
 
@@ -52,9 +53,11 @@ from mudg.stages.scoring.log_points import LogPoints
 
 EDITS: Final = {
     "remove": "- remove: {ids: ['ID']}",
+    "remove, street closed": "- remove: {ids: ['ID'], close_street: true}",
     "move 3 m ahead": "- move: {id: 'ID', along_m: 3}",
     "move 1 m left": "- move: {id: 'ID', left_m: 1}",
     "move 2.5 m left": "- move: {id: 'ID', left_m: 2.5}",
+    "move 2.5 m left, street closed": "- move: {id: 'ID', left_m: 2.5, close_street: true}",
     "insert": "- insert: {asset: {file: ASSET}, id: inserted, near: {id: ego, ahead_m: AHEAD, left_m: LEFT}}",
     "fog": "- weather: {fog: {visibility_m: 60}}",
     "dusk": "- light: {time: dusk}",

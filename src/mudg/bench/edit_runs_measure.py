@@ -16,7 +16,7 @@ from mudg.bench.edit import drawn_pixels
 from mudg.core import edit_scores, flicker, metrics, points_seen
 from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
-from mudg.core.points_seen import DEPTH_LIMIT_M
+from mudg.core.points_seen import DEPTH_LIMIT_M, OwnedPoints
 from mudg.data.edits import EditScript
 from mudg.models.scene.model import SceneModel
 from mudg.stages.editing.carried import EditedDrive, carry_out
@@ -28,6 +28,8 @@ from mudg.stages.scoring.log_points import LogPoints
 
 AROUND_SWEEPS: Final = 12
 """Sweeps of each LiDAR whose static points tell what stands behind a vehicle."""
+COLOR_FRAMES: Final = 4
+"""So many recorded frames, evenly spread, tell the colours of those points."""
 UNKNOWN_M: Final = 1000.0
 """Depth of pixels without any, for the motion between frames."""
 Shown = Callable[[int, Observation, Observation], None]
@@ -113,11 +115,13 @@ def _carrier(seen: Observation) -> flicker.TrueFrame:
 
 @dataclass(slots=True)
 class Sums:
-    """What is pooled over frames: pixels away from the edit and those of them that changed; correlations; depth errors by name."""
+    """What is pooled over frames: pixels away from the edit and those of them that changed; correlations; errors of colours of uncovered
+    points; depth errors by name."""
 
     away: int = 0
     changed: int = 0
     structure: list[float] = field(default_factory=list)
+    colors: list[NDArray[np.float32]] = field(default_factory=list)
     depth: dict[str, metrics.DepthError] = field(default_factory=dict)
 
     def add_depth(self, name: str, seen: Observation, truth: NDArray[np.float32], where: NDArray[np.bool_]) -> None:
@@ -127,6 +131,12 @@ class Sums:
         made = torch.nan_to_num(seen.depth, DEPTH_LIMIT_M, DEPTH_LIMIT_M, DEPTH_LIMIT_M)
         errors = metrics.depth_errors(made, torch.from_numpy(truth)[None], torch.from_numpy(where)[None])
         self.depth.setdefault(name, metrics.DepthError("abs_rel")).add(errors if errors.pixels else None)
+
+    @property
+    def uncovered_psnr(self) -> float | None:
+        """PSNR of the colours of uncovered points."""
+        errors = np.concatenate([np.zeros(0, np.float32), *self.colors])
+        return metrics.psnr_of_errors(torch.from_numpy(errors)) if len(errors) else None
 
     def depth_of(self, name: str) -> float | None:
         """The pooled error."""
@@ -153,7 +163,7 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         else:
             sums.away += int((~touched).sum())
             sums.changed += int((edit_scores.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
-        _add_depths(case, frame, (old, new), (touched, freed), sums)
+        _add_points(case, frame, (old, new), (touched, freed), sums)
         if shown is not None:
             shown(number, old, new)
     kinds = [note["kind"] for note in drive.notes]
@@ -161,6 +171,7 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         "warp": edited.warp, "warp_before": usual.warp, "outside": sums.changed / sums.away if sums.away else None,
         "structure": float(np.mean(sums.structure)) if sums.structure else None,
         "lidar": sums.depth_of("after"), "lidar_before": sums.depth_of("before"), "uncovered": sums.depth_of("uncovered"),
+        "uncovered_psnr": sums.uncovered_psnr,
         "overlap": edited.overlap, "overlap_before": usual.overlap,
         "collisions": kinds.count("collision"), "warnings": len(kinds), "notes": [note["text"] for note in drive.notes],
     }  # fmt: skip
@@ -202,9 +213,10 @@ def _regions(
     return touched, stood & ~stands & ~boxes_mask(view, after) if before else np.zeros_like(stood)
 
 
-def _add_depths(
+def _add_points(
     case: RunCase, frame: Frame, pair: tuple[Observation, Observation], regions: tuple[NDArray[np.bool_], NDArray[np.bool_]], sums: Sums
 ) -> None:
+    """Add the errors of depth and of uncovered colours at LiDAR points."""
     (old, new), (touched, freed) = pair, regions
     truth = case.points.truth_at(frame.view, None)
     if truth is not None:
@@ -213,6 +225,26 @@ def _add_depths(
         sums.add_depth("after", new, truth.depth, where)
     around = case.points.around(frame.view.time_s, AROUND_SWEEPS) if freed.any() else None
     if around is not None:
-        still = around.taken(np.flatnonzero(around.owner == STATIC))
-        depth, _ = points_seen.visible(frame.view, still.xyz, still.gap_deg)
+        rows = np.flatnonzero(around.owner == STATIC)
+        still = around.taken(rows)
+        depth, index = points_seen.visible(frame.view, still.xyz, still.gap_deg)
         sums.add_depth("uncovered", new, depth, (depth > 0) & freed)
+        color, known = _recorded_colors(case, around)
+        asked = freed & (index >= 0)
+        number = rows[index[asked]]
+        made = new.rgb.permute(1, 2, 0).numpy()[asked]
+        sums.colors.append((made - color[number].astype(np.float32) / 255)[known[number]].ravel())
+
+
+def _recorded_colors(case: RunCase, points: OwnedPoints) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Colours u8[N, 3] that recorded frames show at points when nothing hides them, and which of them some frame shows, bool[N]: of
+    ``COLOR_FRAMES`` frames, the middle one first."""
+    middle = (len(case.frames) - 1) / 2
+    spread = np.unique(np.linspace(0, len(case.frames) - 1, COLOR_FRAMES).round().astype(int))
+    color, known = np.zeros((len(points.xyz), 3), np.uint8), np.zeros(len(points.xyz), bool)
+    for number in sorted(spread.tolist(), key=lambda n: abs(n - middle)):
+        frame = case.frames[number]
+        found, there = case.points.colors(frame, points, case.points.placed(points, frame.view.time_s))
+        fresh = there[:-1] & ~known
+        color[fresh], known = found[:-1][fresh], known | fresh
+    return color, known

@@ -12,11 +12,12 @@ from mudg.report import html
 
 HEADS: Final = (
     "run", "edit", "warp error (lower)", "unedited", "outside changed (lower)", "structure (higher)", "LiDAR AbsRel (lower)", "unedited",
-    "uncovered AbsRel (lower)", "overlap (higher)", "unedited", "collisions", "warnings",
+    "uncovered AbsRel (lower)", "uncovered PSNR dB (higher)", "overlap (higher)", "unedited", "collisions", "warnings",
 )  # fmt: skip
 _SHOWN: Final = {
     "warp": "{:.4f}", "warp_before": "{:.4f}", "outside": "{:.2%}", "structure": "{:.3f}", "lidar": "{:.4f}", "lidar_before": "{:.4f}",
-    "uncovered": "{:.3f}", "overlap": "{:.2f}", "overlap_before": "{:.2f}", "collisions": "{}", "warnings": "{}",
+    "uncovered": "{:.3f}", "uncovered_psnr": "{:.2f}",
+    "overlap": "{:.2f}", "overlap_before": "{:.2f}", "collisions": "{}", "warnings": "{}",
 }  # fmt: skip
 _KINDS: Final = ("unedited", "edited", "difference")
 
