@@ -29,6 +29,7 @@ from mudg.base.types import Scene, View
 from mudg.bench import poses as bench_poses
 from mudg.core import metrics
 from mudg.core.edit import Motion
+from mudg.core.edit_scores import SAME
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.raster.rasterize import rasterize
 from mudg.data.city import CityWorld
@@ -52,7 +53,7 @@ EDITS: Final = {
 }
 """Name of a row -> script."""
 _PSNR: Final = ("inside", "inside_before", "vehicle", "vehicle_before", "uncovered")
-CHANGED, SAME = 4 / 255, 1.5 / 255
+CHANGED = 4 / 255
 NEARBY_PX: Final = 3
 EVERY_FRAMES: Final = 3
 

@@ -24,8 +24,9 @@ from mudg.base import log, store
 from mudg.base.types import Observation, View
 from mudg.bench import edit as bench_edit
 from mudg.bench import poses as bench_poses
-from mudg.bench.edit import CHANGED, NEARBY_PX, SAME, EditCase, city_keys
+from mudg.bench.edit import CHANGED, NEARBY_PX, EditCase, city_keys
 from mudg.core import metrics
+from mudg.core.edit_scores import SAME
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.data.city import CityWorld

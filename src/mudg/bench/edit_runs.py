@@ -9,7 +9,8 @@ away and moved, a vehicle of the next run is put in, and fog and dusk come. Ever
     structure  correlation of luminance gradients with the unedited render, [-1, 1]; higher is better (weather and light alone)
     lidar      AbsRel, 0 and up, of rendered depth at the LiDAR points of the moment away from the edit, with the edit and without
     uncovered  AbsRel in the pixels that showed the vehicle and do not any more, at static points of the sweeps around; lower is better.
-               PSNR, dB, of the render's colours there against those that recorded frames show at these points when nothing hides them
+               PSNR, dB, of the render's colours there against those that recorded frames show at these points when neither the vehicle
+               nor its shadow is there; higher is better
     overlap    intersection over union of the vehicle's pixels with the outline of its box, [0, 1], at the new place and at the old one
     collisions, warnings   numbers of what ``mudg edit`` reports
 

@@ -18,6 +18,7 @@ from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.points_seen import DEPTH_LIMIT_M, OwnedPoints
 from mudg.data.edits import EditScript
+from mudg.data.scene import read_image
 from mudg.models.scene.model import SceneModel
 from mudg.stages.editing.carried import EditedDrive, carry_out
 from mudg.stages.editing.plan import EditPlan, EditWorld
@@ -163,7 +164,7 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         else:
             sums.away += int((~touched).sum())
             sums.changed += int((edit_scores.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
-        _add_points(case, frame, (old, new), (touched, freed), sums)
+        _add_points(case, drive.plan, frame, (old, new), (touched, freed), sums)
         if shown is not None:
             shown(number, old, new)
     kinds = [note["kind"] for note in drive.notes]
@@ -214,8 +215,9 @@ def _regions(
 
 
 def _add_points(
-    case: RunCase, frame: Frame, pair: tuple[Observation, Observation], regions: tuple[NDArray[np.bool_], NDArray[np.bool_]], sums: Sums
-) -> None:
+    case: RunCase, plan: EditPlan, frame: Frame, pair: tuple[Observation, Observation],
+    regions: tuple[NDArray[np.bool_], NDArray[np.bool_]], sums: Sums,
+) -> None:  # fmt: skip
     """Add the errors of depth and of uncovered colours at LiDAR points."""
     (old, new), (touched, freed) = pair, regions
     truth = case.points.truth_at(frame.view, None)
@@ -229,22 +231,26 @@ def _add_points(
         still = around.taken(rows)
         depth, index = points_seen.visible(frame.view, still.xyz, still.gap_deg)
         sums.add_depth("uncovered", new, depth, (depth > 0) & freed)
-        color, known = _recorded_colors(case, around)
+        color, known = _recorded_colors(case, plan, around)
         asked = freed & (index >= 0)
         number = rows[index[asked]]
         made = new.rgb.permute(1, 2, 0).numpy()[asked]
         sums.colors.append((made - color[number].astype(np.float32) / 255)[known[number]].ravel())
 
 
-def _recorded_colors(case: RunCase, points: OwnedPoints) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colours u8[N, 3] that recorded frames show at points when nothing hides them, and which of them some frame shows, bool[N]: of
-    ``COLOR_FRAMES`` frames, the middle one first."""
+def _recorded_colors(case: RunCase, plan: EditPlan, points: OwnedPoints) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Colours u8[N, 3] that recorded frames show at points, and which of them some frame shows, bool[N]: of ``COLOR_FRAMES`` frames, the
+    middle one first. What lies in the boxes of the edit's objects or on the ground about them, where their shadow lies, is not known."""
     middle = (len(case.frames) - 1) / 2
     spread = np.unique(np.linspace(0, len(case.frames) - 1, COLOR_FRAMES).round().astype(int))
     color, known = np.zeros((len(points.xyz), 3), np.uint8), np.zeros(len(points.xyz), bool)
     for number in sorted(spread.tolist(), key=lambda n: abs(n - middle)):
         frame = case.frames[number]
-        found, there = case.points.colors(frame, points, case.points.placed(points, frame.view.time_s))
-        fresh = there[:-1] & ~known
-        color[fresh], known = found[:-1][fresh], known | fresh
+        boxes = touched_boxes(plan, frame.view.time_s, "before")
+        spoilt = boxes_mask(frame.view, boxes) | ground_mask(frame.view, boxes)
+        image = np.dstack([read_image(case.scene, frame), spoilt.astype(np.uint8)])
+        placed = case.points.placed(points, frame.view.time_s)
+        found, there = points_seen.carried(frame.view, image, placed, points.gap_deg)
+        fresh = there[:-1] & ~known & (found[:-1, 3] == 0)
+        color[fresh], known = found[:-1][fresh, :3], known | fresh
     return color, known

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from mudg.core.weather.tone import LUMA
+
 SAME: Final = 1.5 / 255
 """Colours of 8 bits that differ by more than this differ by more than one step."""
-_LUMA: Final = np.array([0.2126, 0.7152, 0.0722], np.float32)[:, None, None]
 
 
 def changed_pixels(edited: Tensor, unedited: Tensor) -> NDArray[np.bool_]:
@@ -30,8 +31,8 @@ def gradient_correlation(edited: Tensor, unedited: Tensor) -> float | None:
 
 
 def _gradients(rgb: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Sobel derivatives f64[2, H, W] of the luminance along columns and rows."""
-    luminance = (rgb * _LUMA).sum(0).astype(np.float64)
+    """Sobel derivatives f64[2, H, W] of the brightness along columns and rows."""
+    luminance = np.tensordot(LUMA, rgb, 1)
     return np.stack([ndimage.sobel(luminance, axis=axis, mode="nearest") for axis in (1, 0)])
 
 

@@ -324,7 +324,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 start_unseen_gaussians(state, config, raster)
             views = next(upcoming)
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views][0]
+            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
             state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
@@ -338,7 +338,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
 
             state.step, state.seconds = step, state.seconds + time.perf_counter() - began
             if step % 20 == 0 or step == config.iterations or densified:
-                state.last = _progress(state, views[0], *learnt)
+                state.last = _progress(state, views[0], *learnt[0])
                 folder.log(step=step, view=views[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
                 bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:

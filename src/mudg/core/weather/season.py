@@ -19,9 +19,9 @@ from mudg.base.weather_settings import SeasonSettings
 from mudg.core.weather.gbuffer import GBuffer, world_points
 from mudg.core.weather.ground import noise_seed
 from mudg.core.weather.noise import patches, smoothstep
+from mudg.core.weather.tone import LUMINANCE
 
 Array = NDArray[np.float64]
-LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 LEAVES: Final = {"autumn": ((0.62, 0.36, 0.06), (0.55, 0.17, 0.04), (0.30, 0.16, 0.06)), "bare": ((0.21, 0.18, 0.15), (0.25, 0.22, 0.19))}
 """Reflectances of what is left on trees, between which patches change."""
 GRASS: Final = {"autumn": (0.30, 0.27, 0.11), "bare": (0.29, 0.25, 0.16)}

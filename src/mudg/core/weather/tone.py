@@ -12,6 +12,9 @@ from mudg.base.weather_settings import ResponseSettings
 
 Image = NDArray[np.float32]
 LUMA = np.array([0.299, 0.587, 0.114])
+"""Brightness of display values."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Brightness of linear light."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from mudg.base import geometry
 from mudg.core.table import Table
+from mudg.core.weather.tone import LUMINANCE
 from mudg.models.scene.edited import display_of, linear_of
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import SceneModel
@@ -47,7 +48,6 @@ SOURCES: Final = 160
 BRIGHT: Final = 1.25
 """but not from those that are brighter than the `AROUND` about them by this factor, which are markings, nor from shadows."""
 AROUND: Final = 40
-LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 
 
 def colors_of(model: SceneModel) -> Array:

@@ -51,7 +51,7 @@ ROUNDS: Final = 4
 """What goes may have hidden more that nobody saw."""
 FLOOR_M: Final = 0.15
 STRAY_M: Final = 0.4
-"""Gaussians of road users this far beside the box are parts of the object."""
+"""Gaussians of road users this far beside the box are parts of the object, and so are static points this high above its bottom."""
 LEAST_GROUND: Final = 48
 CELL_M: Final = 0.3
 BEHIND_M: Final = 80.0

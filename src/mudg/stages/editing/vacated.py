@@ -24,6 +24,7 @@ from mudg.data.clips.vacated import Vacated, VacatedAt
 from mudg.data.edits import EditScript
 from mudg.models.scene.edited import GROUND_CLASSES
 from mudg.models.scene.model import SceneModel
+from mudg.models.scene.uncovered import FLOOR_M, STRAY_M
 from mudg.stages.editing.apply import edited_cloud, edited_scene
 from mudg.stages.editing.carried import carry_out, opener
 from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
@@ -40,9 +41,6 @@ BOX_GROWTH_M: Final = 0.2
 SAME_M: Final = 1e-3
 FARTHEST_GROUND_M: Final = 80.0
 """Nothing is known of how the ground goes on farther away."""
-STRAY_M: Final = 0.4
-STRAY_FLOOR_M: Final = 0.15
-"""Static points this far beside a box, and this high above its bottom, are taken for parts of what was in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +156,7 @@ def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
             local = geometry.transform_points(geometry.invert(pose), static.xyz.astype(np.float64))
             half = np.asarray(actor.size_m) / 2
             inside = (np.abs(local[:, :2]) <= half[:2] + STRAY_M).all(1) & (local[:, 2] <= half[2] + STRAY_M)
-            stray |= inside & (local[:, 2] > STRAY_FLOOR_M - half[2])
+            stray |= inside & (local[:, 2] > FLOOR_M - half[2])
     kept = ~(stray & ~low_of)
     part = lambda values: None if values is None else values[kept]  # noqa: E731
     return replace(cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=part(static.semantics)))
