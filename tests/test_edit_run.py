@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,17 @@ from mudg import cli, verbs
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
+from mudg.base.types import Scene
 from mudg.bench import run as bench
 from mudg.data.cloudfile import read_fused, write_fused
+from mudg.data.edits import parse_edits
 from mudg.data.observations import read_observations
 from mudg.data.scene import check_scene, read_image, read_label, read_points, read_scene
 from mudg.stages import edit, fit, fuse, render
 from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, RenderConfig
+from mudg.stages.editing.apply import left_behind
+from mudg.stages.editing.carried import EditedDrive, carry_out
+from mudg.stages.fitting.storage import load_model
 
 FRAMES = 4
 LAST_S = 0.3 * (FRAMES - 1)
@@ -215,13 +221,32 @@ def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "fit").exists()
 
 
+def test_streets_of_recordings_are_closed_and_those_of_generated_cities_stay(run: Path) -> None:
+    model, scene = load_model(run / "fit" / "street_gaussians"), read_scene(run / "scene")
+    city = replace(scene, source=replace(scene.source, recipe={"seed": 1}))
+
+    def carried(where: Scene | None, text: str = "") -> EditedDrive:
+        return carry_out(parse_edits(f"- remove: {{ids: [car]{text}}}", "e"), model, where)
+
+    def closed(where: Scene | None, text: str = "") -> tuple[str, ...]:
+        return left_behind(model, carried(where, text).plan)[2]
+
+    assert closed(scene) == ("car",) and closed(city) == closed(None) == ()
+    assert closed(scene, ", close_street: false") == () and closed(city, ", close_street: true") == ("car",)
+    kinds = lambda drive: [note["kind"] for note in drive.notes]  # noqa: E731
+    assert kinds(carried(None, ", close_street: true")) == ["street not closed"]
+    assert "street not closed" not in kinds(carried(None)) + kinds(carried(scene)) + kinds(carried(city, ", close_street: true"))
+    rows = [len(drive.model(model).table) for drive in (carried(scene), carried(city), carried(scene, ", close_street: false"))]
+    assert rows[1] == rows[2] != rows[0]
+
+
 def test_from_python(run: Path, tmp_path: Path) -> None:
     fitted = mudg.FittedScene.read(run / "fit" / "street_gaussians")
     scene = mudg.read_scene(run / "scene")
     edits = script(tmp_path, "- stop: {id: car, at_s: 0.3}")
     stopped = fitted.edited(edits, scene)
     assert stopped.object_pose("car", 0.9)[0, 3] < fitted.object_pose("car", 0.9)[0, 3] - 0.5
-    made = verbs.edit(run / "fit" / "street_gaussians", edits, tmp_path / "out")
+    made = verbs.edit(run / "fit" / "street_gaussians", edits, tmp_path / "out", scene=run / "scene")
     view = scene.frames[2].view
     pictures = [s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))]
     assert np.array_equal(*pictures)

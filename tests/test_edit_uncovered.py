@@ -194,13 +194,26 @@ def test_colours_continue_without_markings() -> None:
     assert np.abs(places[near[0]]).max() == pytest.approx(1.6)
 
 
-def test_a_script_says_whose_traces_go() -> None:
+@pytest.mark.parametrize("usual", [False, True])
+def test_a_script_says_whose_traces_go(usual: bool) -> None:
     actor, _ = lead()
-    for verb, text in (("remove", "ids: [a]"), ("move", "id: a, along_m: 9")):
+    sources = EditSources(lambda s: None, lambda n: None, close_street=usual)  # type: ignore[arg-type,return-value]
+
+    def closed(text: str) -> set[str]:
+        return plan_edits(parse_edits(text, "e"), EditWorld({"a": actor, "b": actor}, ego=actor.motion), sources).closed
+
+    verbs = {
+        "remove": "ids: [a]", "move": "id: a, along_m: 9", "stop": "id: a, at_s: 0.5", "speed": "id: a, factor: 0.5",
+        "lane_change": "id: a, left_m: 1, start_s: 0, duration_s: 1, most_lateral_m_s2: 9", "path": "id: a, points: [[0, 0, 0], [1, 9, 0]]",
+    }  # fmt: skip
+    for verb, text in verbs.items():
         for asked in (True, False):
-            script = parse_edits(f"- {verb}: {{{text}, close_street: {str(asked).lower()}}}", "e")
-            plan = plan_edits(script, EditWorld({"a": actor}), EditSources(lambda s: None, lambda n: None))  # type: ignore[arg-type,return-value]
-            assert plan.closed == ({"a"} if asked else set())
+            assert closed(f"- {verb}: {{{text}, close_street: {str(asked).lower()}}}") == ({"a"} if asked else set())
+        assert closed(f"- {verb}: {{{text}}}") == ({"a"} if usual else set())
+    assert closed("- move: {id: a, along_m: 9, close_street: true}\n- stop: {id: a, at_s: 0.5}") == {"a"}
+    assert closed("- move: {id: a, along_m: 9}\n- stop: {id: a, at_s: 0.5, close_street: false}") == set()
+    assert closed("- move: {id: ego, left_m: 1}") == set()
+    assert closed("- move: {id: a, left_m: 0, close_street: true}") == set()  # nobody has left
 
 
 def test_sky_that_the_car_always_hid_continues_the_sky_that_was_seen() -> None:

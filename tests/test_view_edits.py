@@ -31,7 +31,9 @@ from mudg.report.viewer.facts import UNKNOWN, PageFacts, with_ground
 from mudg.stages import edit, render
 from mudg.stages.config import EditConfig, RenderConfig
 from mudg.stages.config.view import PageConfig
+from mudg.stages.editing.apply import street_left
 from mudg.stages.editing.carried import carry_out
+from mudg.stages.editing.plan import EditPlan
 from mudg.stages.editing.weathered import conditions_of, in_weather, weather_of
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import edits as desk_module
@@ -122,6 +124,27 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
     assert np.abs(drawn(script) - wet).max() < 0.003
     assert np.abs(drawn(script) - seen).max() > 0.1
     assert np.abs(drawn(SCRIPT) - seen).max() == 0
+
+
+def test_a_street_is_closed_once_and_only_for_frames(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def counted(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
+        calls.append(close)
+        return street_left(model, plan, close=close)
+
+    monkeypatch.setattr(desk_module, "street_left", counted)
+    scene = read_scene(toy[0] / "scene")
+    desk, scripts = desk_of(toy, tmp_path / "edits.yaml"), [f"- move: {{id: car-1, left_m: {x}, close_street: true}}\n" for x in (1, 2, 3)]
+    notes = [said(desk, script)["notes"] for script in scripts]
+    assert all(any("close the street" in note for note in of) for of in notes) and True not in calls
+    for script in scripts:
+        made, plain = desk.edited(script)[0], carry_out(parse_edits(script, "edits.yaml"), toy[2], scene).model(toy[2])
+        assert torch.equal(made.table["means"], plain.table["means"]) and torch.equal(made.table["sh_dc"], plain.table["sh_dc"])
+        assert np.array_equal(motion_of(made.dynamic_object("car-1")).poses, motion_of(plain.dynamic_object("car-1")).poses)
+    assert calls.count(True) == 1
+    desk.edited("- remove: {ids: [car-1], close_street: true}\n")
+    assert calls.count(True) == 2
 
 
 def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_path: Path) -> None:

@@ -53,11 +53,11 @@ from mudg.stages.fitting.storage import model_of_scene
 from mudg.stages.scoring.log_points import LogPoints
 
 EDITS: Final = {
-    "remove": "- remove: {ids: ['ID']}",
+    "remove": "- remove: {ids: ['ID'], close_street: false}",
     "remove, street closed": "- remove: {ids: ['ID'], close_street: true}",
-    "move 3 m ahead": "- move: {id: 'ID', along_m: 3}",
-    "move 1 m left": "- move: {id: 'ID', left_m: 1}",
-    "move 2.5 m left": "- move: {id: 'ID', left_m: 2.5}",
+    "move 3 m ahead": "- move: {id: 'ID', along_m: 3, close_street: false}",
+    "move 1 m left": "- move: {id: 'ID', left_m: 1, close_street: false}",
+    "move 2.5 m left": "- move: {id: 'ID', left_m: 2.5, close_street: false}",
     "move 2.5 m left, street closed": "- move: {id: 'ID', left_m: 2.5, close_street: true}",
     "insert": "- insert: {asset: {file: ASSET}, id: inserted, near: {id: ego, ahead_m: AHEAD, left_m: LEFT}}",
     "fog": "- weather: {fog: {visibility_m: 60}}",

@@ -64,7 +64,7 @@ class RemoveEdit(StrictRecord):
     class_: Name | None = Field(default=None, alias="class")
     moving: bool | None = None
     within_m: Positive | None = None
-    close_street: bool = False
+    close_street: bool | None = None
 
     @model_validator(mode="after")
     def _either(self) -> Self:
@@ -90,7 +90,7 @@ class MoveEdit(StrictRecord):
     from_s: Number | None = None
     ramp_s: NotNegative = 1.0
     ground: bool = True
-    close_street: bool = False
+    close_street: bool | None = None
 
 
 class StopEdit(StrictRecord):
@@ -99,6 +99,7 @@ class StopEdit(StrictRecord):
     id: Name
     at_s: Number
     brake_m_s2: Annotated[float, Field(gt=0, le=12)] = 4.0
+    close_street: bool | None = None
 
 
 class SpeedEdit(StrictRecord):
@@ -107,6 +108,7 @@ class SpeedEdit(StrictRecord):
     id: Name
     factor: Annotated[float, Field(gt=0, le=5)]
     from_s: Number | None = None
+    close_street: bool | None = None
 
 
 class LaneChangeEdit(StrictRecord):
@@ -118,6 +120,7 @@ class LaneChangeEdit(StrictRecord):
     duration_s: Positive
     most_lateral_m_s2: Positive = 4.0
     ground: bool = True
+    close_street: bool | None = None
 
 
 def _path_points(points: list[list[float]]) -> list[list[float]]:
@@ -142,6 +145,7 @@ class PathEdit(StrictRecord):
     id: Name
     points: Points
     ground: bool = True
+    close_street: bool | None = None
 
     @model_validator(mode="after")
     def _drives(self) -> Self:

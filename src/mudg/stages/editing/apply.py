@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -32,24 +32,49 @@ EGO_FACT: Final = "edited_ego"
 """Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
 CUT_SHADOW: Final = 0.6
 """Strength of the contact shadow of what was cut out of the background."""
+MOST_NAMED: Final = 4
+"""More objects than these are counted in a message."""
 
 
-def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None) -> SceneModel:
+StreetOf = Callable[[SceneModel, EditPlan], SceneModel]
+"""Makes of a fitted scene the one that objects have left: ``street_left``, or something that remembers its results."""
+
+
+def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
+    """A fitted scene without the objects that a plan removes, with objects of their own for standing ones that it moves, and without
+    the traces of those behind which the street is closed (unless told not to `close` it). Depends on `left_behind` alone."""
+    without_nodes, removed, closed = left_behind(model, plan)
+    model = _cut_out(model, without_nodes, plan)
+    removed = tuple(name for name in removed if name in model.node_names())
+    model = model.without_nodes([name for name in removed if not (close and name in closed)])
+    if closed and close:
+        hidden, views = {name: hidden_by(plan.before.actors[name], plan.views) for name in closed}, spread(plan.views)
+        log.info(f"edit: the street behind {_some(closed)} is closed from {len(views)} recorded views (close_street)")
+        model = noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
+        model = without_traces(model, hidden, views, raster_of(model))
+    return model
+
+
+def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Ids of what a plan cuts out of the background, of what it removes, and of those behind which the street is closed."""
+    without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
+    closed = sorted(plan.closed & set(plan.before.actors)) if plan.views else []
+    if plan.background is not None:  # it is gone with the street
+        without_nodes, closed = [], []
+    return tuple(without_nodes), tuple(plan.removed), tuple(closed)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= MOST_NAMED else f"{len(names)} objects"
+
+
+def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None, street_of: StreetOf = street_left) -> SceneModel:
     """A fitted scene with a plan carried out.
 
     Args:
-        sky: panorama of the plan's ``sky``.
+        sky: panorama of the plan's ``sky``. street_of: makes the street that objects left, or remembers it.
     """
-    without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
-    for name in without_nodes if plan.background is None else ():  # else it is gone with the street
-        model = _cut_out(model, name, plan)
-    closed = {name: plan.before.actors[name] for name in sorted(plan.closed & set(plan.before.actors)) if plan.background is None}
-    removed = [name for name in plan.removed if name in model.node_names()]
-    model = model.without_nodes([name for name in removed if name not in closed])
-    if closed:
-        hidden, views = {name: hidden_by(actor, plan.views) for name, actor in closed.items()}, spread(plan.views)
-        model = noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
-        model = without_traces(model, hidden, views, raster_of(model))
+    model = street_of(model, plan)
     if plan.background is not None:
         other, pose = plan.background
         model = edited.with_background(model, other.model, pose)
@@ -80,24 +105,30 @@ def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
     return Hidden(actor.size_m, actor.motion, actor.moves, tuple(spread(there)))
 
 
-def _cut_out(model: SceneModel, name: str, plan: EditPlan) -> SceneModel:
-    """A copy with an object of its own for what stands in a box; unchanged where the fit shows nothing that is to be removed.
+def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneModel:
+    """A copy with objects of their own for what stands in boxes. What the fit does not show is named, if it is only to be removed.
 
     Raises:
         UsageError: an object that is to be moved does not show in the fit.
     """
-    actor = plan.before.actors[name]
-    try:
-        if actor.moves:
-            raise UsageError("this object has no Gaussians of its own in the fit: the recording hardly saw it", where=f"track {name!r}",
-                remedy="leave it out of the script")  # fmt: skip
-        cut = edited.cut_out(model, _track(name, actor))
-    except UsageError as problem:
-        if name not in plan.removed:
-            raise
-        log.info(f"edit: {name} is not in the fit: {problem.what}")
-        return model
-    return cut if name in plan.removed else edited.with_shadow(cut, name, CUT_SHADOW)
+    missing: dict[str, str] = {}
+    for name in names:
+        actor = plan.before.actors[name]
+        try:
+            if actor.moves:
+                raise UsageError("this object has no Gaussians of its own in the fit: the recording hardly saw it", where=f"track {name!r}",
+                    remedy="leave it out of the script")  # fmt: skip
+            cut = edited.cut_out(model, _track(name, actor))
+        except UsageError as problem:
+            if name not in plan.removed:
+                raise
+            missing[name] = problem.what
+            continue
+        model = cut if name in plan.removed else edited.with_shadow(cut, name, CUT_SHADOW)
+    if missing:
+        why = next(iter(missing.values())) if len(missing) == 1 else "they have no Gaussians of their own, and none are in their boxes"
+        log.info(f"edit: {_some(list(missing))}: not in the fit: {why}")
+    return model
 
 
 def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:

@@ -19,7 +19,16 @@ from mudg.data.edits.records import AssetSource
 from mudg.data.scene import read_scene
 from mudg.models.scene.edited import GROUND_CLASSES, Asset, ground_points, lowest_points
 from mudg.models.scene.model import SceneModel
-from mudg.stages.editing.apply import EGO_FACT, edited_cloud, edited_model, edited_scene, ego_fact, ground_of
+from mudg.stages.editing.apply import (
+    EGO_FACT,
+    StreetOf,
+    edited_cloud,
+    edited_model,
+    edited_scene,
+    ego_fact,
+    ground_of,
+    street_left,
+)
 from mudg.stages.editing.assets import asset_from, read_asset
 from mudg.stages.editing.checks import check
 from mudg.stages.editing.plan import Background, EditPlan, EditSources, EditWorld, plan_edits
@@ -48,14 +57,15 @@ class EditedDrive:
     cloud: FusedCloud | None
     notes: list[dict[str, Any]]
 
-    def model(self, model: SceneModel, keep_ego: bool = False) -> SceneModel:
+    def model(self, model: SceneModel, keep_ego: bool = False, street_of: StreetOf = street_left) -> SceneModel:
         """A fitted scene of this drive, edited.
 
         Args:
             keep_ego: note the vehicle's new path in the scene's facts, for those who know the recorded path alone.
+            street_of: makes the street that objects left (``apply.street_left``), or remembers it.
         """
         sky = None if self.plan.sky is None else self.script.path_of(self.plan.sky.image)
-        made = edited_model(model, self.plan, sky)
+        made = edited_model(model, self.plan, sky, street_of)
         facts = {**made.facts, FACT: {"script": self.script.canonical(), "notes": self.notes}}
         if keep_ego and self.plan.moves_ego and self.plan.after.ego is not None:
             facts[EGO_FACT] = ego_fact(self.plan.after.ego)
@@ -77,14 +87,25 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
             remedy="fit a scene with labels (`mudg annotate` makes them), or take them out of the script")  # fmt: skip
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
-    plan = plan_edits(script, world, EditSources(opener(script), lambda name: background_of(find_run(script.path_of(name)), name)))
+    background = lambda name: background_of(find_run(script.path_of(name)), name)  # noqa: E731
+    closes = scene is not None and is_recording(scene)
+    plan = plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
+    if scene is None and plan.closed:
+        plan.notes.append({"kind": "street not closed", "ids": sorted(plan.closed),
+                           "text": f"the street behind {', '.join(sorted(plan.closed))} stays as it was fitted: what recorded views show of "
+                                   "it is not known (give --scene)"})  # fmt: skip
     made = None if scene is None else edited_scene(scene, plan)
     views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
     notes = check(plan, *views)
     for note in notes:
         (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
     return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
+
+
+def is_recording(scene: Scene) -> bool:
+    """Whether a scene comes from sensors and not from the city generator, which has exact pictures of what an object hid."""
+    return scene.source.recipe is None
 
 
 def background_of(parts: RunParts, name: str) -> Background:

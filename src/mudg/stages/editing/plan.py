@@ -48,9 +48,12 @@ class EditSources:
 
     asset: OpenAsset
     background: Callable[[str], Background]
+    close_street: bool = False
+    """Whether the street is closed behind what leaves its place, where a script does not say."""
 
 
 VEHICLE_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "trailer"})
+SAME_PLACE_M: Final = 1e-4
 MOVING_M: Final = 1.0
 """An object moves if its box gets farther than this from its first place."""
 
@@ -121,7 +124,7 @@ class EditPlan:
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
-        closed: actors of the recording without whose traces the street is to be shown (``models/scene/uncovered.py``).
+        closed: actors without whose traces the street is to be shown, if they were recorded (``models/scene/uncovered.py``).
     """
 
     before: EditWorld
@@ -146,6 +149,10 @@ class EditPlan:
         return tuple(dict.fromkeys([*(name for name in self.changes if name in self.after.actors), *self.inserted]))
 
 
+_DISPLACING: Final = frozenset({"move", "stop", "speed", "lane_change", "path"})
+"""Verbs after which an object is not where it was recorded."""
+
+
 def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> EditPlan:
     """Carry out a script on paths.
 
@@ -158,9 +165,20 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
             continue
         try:
             _VERBS[edit.verb](plan, edit.settings, sources)
+            if edit.verb in _DISPLACING:
+                _close(plan, edit.settings.id, edit.settings, sources)
         except (InputError, UsageError) as problem:
             raise _located(problem, edit) from problem
+    plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
     return plan
+
+
+def _left_its_place(plan: EditPlan, name: str) -> bool:
+    before, after = (world.actors.get(name) for world in (plan.before, plan.after))
+    if before is None or after is None or name in plan.inserted:
+        return before is not None
+    old, new = before.motion.poses, after.motion.poses
+    return old.shape != new.shape or not np.allclose(old, new, atol=SAME_PLACE_M)
 
 
 def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
@@ -171,13 +189,19 @@ def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
 # -- verbs ---------------------------------------------------------------------------------------------------------------
 
 
-def _remove(plan: EditPlan, given: Any, _: EditSources) -> None:
+def _remove(plan: EditPlan, given: Any, sources: EditSources) -> None:
     names = given.ids if given.ids is not None else _chosen(plan.after, given)
     for name in names:
         _actor(plan.after, name)
         _take_away(plan, name)
-        if given.close_street:
-            plan.closed.add(name)
+        _close(plan, name, given, sources)
+
+
+def _close(plan: EditPlan, name: str, given: Any, sources: EditSources) -> None:
+    """Note whether the street is to be closed behind an object; the last edit that says so counts."""
+    if name == EGO or (given.close_street is None and not sources.close_street):
+        return
+    (plan.closed.discard if given.close_street is False else plan.closed.add)(name)
 
 
 def _take_away(plan: EditPlan, name: str) -> None:
@@ -211,8 +235,6 @@ def _nearest_m(world: EditWorld, actor: Actor) -> float:
 
 def _move(plan: EditPlan, given: Any, _: EditSources) -> None:
     by = Displacement(given.along_m, given.left_m, given.up_m, math.radians(given.yaw_deg), given.from_s, given.ramp_s)
-    if given.close_street and given.id != EGO:
-        plan.closed.add(given.id)
     _change(plan, given.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if given.ground else None))
 
 

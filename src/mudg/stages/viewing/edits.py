@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,7 +22,9 @@ from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.report.viewer.facts import begin_of
 from mudg.report.viewer.packed import key_rows
+from mudg.stages.editing.apply import left_behind, street_left
 from mudg.stages.editing.carried import EditedDrive, carry_out
+from mudg.stages.editing.plan import EditPlan
 from mudg.stages.editing.runs import find_run
 
 MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
@@ -32,6 +35,8 @@ SEALED: Final = (store.MANIFEST, "run.json", "model.json")
 """A folder that holds one of these is the result of a command: nothing is added to it."""
 KEPT: Final = 2
 """Scripts whose edited scenes stay in memory: that of the picture, and the one before."""
+STREETS: Final = 3
+"""Streets that objects have left, kept in memory for each fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +72,11 @@ class EditDesk:
     begin: EditScript | None = None
     overwrite: bool = False
     run: str = ""
-    _made: dict[str, tuple[EditedDrive, list[SceneModel]]] = field(default_factory=dict)
+    _planned: dict[str, EditedDrive] = field(default_factory=dict)
+    _made: dict[str, list[SceneModel]] = field(default_factory=dict)
+    _streets: dict[tuple[object, ...], SceneModel] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
+    _making: threading.Lock = field(default_factory=threading.Lock)
 
     def entries(self) -> list[dict[str, Any]]:
         """The edits that the page begins with, as [{verb: settings}] with absolute paths."""
@@ -89,11 +97,26 @@ class EditDesk:
         Raises:
             InputError: it cannot be carried out; the message names line, verb and field.
         """
-        return self._carried(text)[1] if text.strip() else list(self.models)
-
-    def _carried(self, text: str) -> tuple[EditedDrive, list[SceneModel]]:
-        with self._lock:
+        if not text.strip():
+            return list(self.models)
+        drive = self._carried(text)
+        with self._making:
             if text not in self._made:
+                made = [drive.model(model, street_of=self._street) for model in self.models]
+                self._made = {**_last(self._made, KEPT - 1), text: made}
+            return self._made[text]
+
+    def _street(self, model: SceneModel, plan: EditPlan) -> SceneModel:
+        """What ``street_left`` makes, remembered: closing a street takes seconds, and an object is moved many times."""
+        key = (id(model), *left_behind(model, plan))
+        if key not in self._streets:
+            self._streets = {**_last(self._streets, STREETS * len(self.models) - 1), key: street_left(model, plan)}
+        return self._streets[key]
+
+    def _carried(self, text: str) -> EditedDrive:
+        """A script carried out on all but the fits; quick."""
+        with self._lock:
+            if text not in self._planned:
                 script = parse_edits(text, NAME)
                 known = (
                     {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
@@ -103,15 +126,14 @@ class EditDesk:
                     raise InputError("a page may name no files but those of --edits", where=NAME, got=foreign[0],
                         remedy="write them into the script by hand")  # fmt: skip
                 drive = carry_out(script, self.models[0], self.scene, self.cloud)
-                made = drive, [drive.model(model) for model in self.models]
-                self._made = {**dict(list(self._made.items())[-(KEPT - 1) :]), text: made}
-            return self._made[text]
+                self._planned = {**_last(self._planned, KEPT - 1), text: drive}
+            return self._planned[text]
 
     def answer(self, asked: EditRequest) -> tuple[bytes, str]:
         """What a script does, as JSON: paths of changed objects, who is gone, notes, the file that was saved."""
         said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
         if asked.script.strip():
-            drive, _ = self._carried(asked.script)
+            drive = self._checked(asked.script)
             said |= {
                 "paths": self._paths(drive), "removed": list(drive.plan.removed), "inserted": list(drive.plan.inserted),
                 "notes": [note["text"] for note in drive.notes] + _unseen(drive),
@@ -119,6 +141,16 @@ class EditDesk:
         if asked.save:
             said["saved"] = str(self.save(asked.script))
         return store.json_text(said, indent=None).encode(), "application/json"
+
+    def _checked(self, text: str) -> EditedDrive:
+        """A script that can be carried out on the fits, too. Streets are closed later, when a frame is asked for."""
+        drive = self._carried(text)
+        if not drive.plan.closed:
+            self.edited(text)
+            return drive
+        for model in self.models:
+            drive.model(model, street_of=functools.partial(street_left, close=False))
+        return drive
 
     def _paths(self, drive: EditedDrive) -> dict[str, Any]:
         """Keys of changed objects: ``rows`` as in ``key_rows``, ``source`` the moments of the recording that they show."""
@@ -152,11 +184,20 @@ class EditDesk:
         return self.place
 
 
+def _last(kept: dict[Any, Any], count: int) -> dict[Any, Any]:
+    """The last entries of a dictionary."""
+    return dict(list(kept.items())[len(kept) - min(count, len(kept)) :])
+
+
 def _unseen(drive: EditedDrive) -> list[str]:
-    """What exact frames do not show of a script."""
-    if not drive.plan.moves_ego:
-        return []
-    return ["the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"]
+    """What the page, or its exact frames, do not show of a script."""
+    found = []
+    if drive.plan.closed and drive.plan.views:
+        found.append("exact frames close the street that objects leave (close_street), the first one after some seconds; the page's own "
+                     "picture shows it as it was fitted")  # fmt: skip
+    if drive.plan.moves_ego:
+        found.append("the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle")
+    return found
 
 
 def desk_for(
