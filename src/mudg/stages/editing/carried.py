@@ -93,8 +93,8 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
     if scene is None and plan.closed:
         plan.notes.append({"kind": "street not closed", "ids": sorted(plan.closed),
-                           "text": f"the street behind {', '.join(sorted(plan.closed))} stays as it was fitted: what recorded views show of "
-                                   "it is not known (give --scene)"})  # fmt: skip
+                           "text": f"the street behind {', '.join(sorted(plan.closed))} stays as it was fitted: what recorded views show "
+                                   "of it is not known (give --scene)"})  # fmt: skip
     made = None if scene is None else edited_scene(scene, plan)
     views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
     notes = check(plan, *views)
