@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import tempfile
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -104,6 +105,8 @@ def in_child(work: Callable[[], Any], act: Act, root: Path) -> int:
         except OSError:
             code = 3
         finally:
+            if code == 1:
+                traceback.print_exc()  # pytest does not see what ended the child
             os._exit(code)
     _, status = os.waitpid(child, 0)
     return os.waitstatus_to_exitcode(status)

@@ -207,7 +207,8 @@ def test_variants_share_no_function_with_the_rest(mc: ModuleType, tmp_path: Path
         symbols = subprocess.run(["nm", "--defined-only", str(target)], capture_output=True, text=True, check=True).stdout
         kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
         assert any(name in symbol for symbol in kinds)
-        assert [s for s, kind in kinds.items() if kind in "WVu"] == []
+        weak = [s for s, kind in kinds.items() if kind in "WVu" and not s.startswith("DW.ref.")]  # those are addresses, alike in all
+        assert weak == []
         assert [s for s in kinds if "GLOBAL__sub_I" in s] == []  # nothing runs when the library is loaded
 
 

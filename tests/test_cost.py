@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import NamedTuple
 import pytest
 import toy_views
 
-from mudg import native, verbs
+from mudg import native
 from mudg.base import store
 from mudg.core.raster import probe
 from mudg.stages import doctor
@@ -243,10 +245,12 @@ def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_real_run_is_forecast(tmp_path: Path) -> None:
     """Processor seconds, memory and bytes of every step; the clock of a shared machine says little."""
-    verbs.run("city", tmp_path / "out", preset="fast")
+    command = [sys.executable, "-m", "mudg", "run", "city", "--preset", "fast", "--out", str(tmp_path / "out"), "--quiet"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # a process of its own: what earlier tests took would count
     steps = store.read_json(tmp_path / "out" / "run.json")["steps"]
     cores = native.default_threads()
-    found = cost.estimate(run_preset("fast"), FAST, cost.Machine(cores, probe.speed(cores)))
+    speed = max(probe.speed(cores) for _ in range(5))  # other programs at work lower it
+    found = cost.estimate(run_preset("fast"), FAST, cost.Machine(cores, speed))
     for name, forecast in found.steps.items():
         measured = steps[name]
         assert forecast.written_bytes == pytest.approx(measured["written_bytes"], rel=0.5, abs=1e6), name

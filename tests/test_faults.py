@@ -169,7 +169,8 @@ def test_a_verb_stopped_at_any_point_is_repeated_to_the_same_bytes(
         place = tmp_path / f"stop{number}"
         place.mkdir()
         status = in_child(lambda place=place: work(place / "out"), stopped(number), place)
-        assert status == -9 if stopped is killed else status in (0, 1), found[number - 1]  # asked at the very end, it finishes
+        told = f"status {status} at {found[number - 1]}"
+        assert status == -9 if stopped is killed else status in (0, 1), told  # asked at the very end, it finishes
         work(place / "out")
         same_result(name, place / "out", tmp_path / "whole")
         assert not leftovers(place), found[number - 1]
@@ -235,7 +236,8 @@ def test_a_training_stopped_at_every_point_is_repeated_to_the_same_bytes(
         place = tmp_path / f"stop{number}"
         place.mkdir()
         status = in_child(lambda place=place: small_training(clips, place / "out"), stopped(number), place)
-        assert status == -9 if stopped is killed else status in (0, 1), number  # asked at the very end, it finishes
+        told = f"status {status} at {number}"
+        assert status == -9 if stopped is killed else status in (0, 1), told  # asked at the very end, it finishes
         small_training(clips, place / "out")
         found = learned(place / "out")
         assert found.keys() == whole.keys(), number
