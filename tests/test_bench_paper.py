@@ -16,6 +16,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.bench import paper, paper_logs, paper_numbers, paper_text
 from mudg.bench import run as bench
+from mudg.bench.chain import LONGER
 from mudg.bench.paper_tables import (
     FID,
     FVD,
@@ -95,7 +96,9 @@ def test_published_rows_are_read_in_order():
 
 def test_methods_are_all_of_this_version_unless_some_are_named():
     rows = paper.rows_of(BenchConfig(), TABLES["mudg1"])
-    assert [row.method for row in rows] == list(METHODS)
+    assert [row.name for row in rows if row.name != LONGER] == list(METHODS)
+    control = next(row for row in rows if row.name == LONGER)
+    assert control.method == "street_gaussians" and not control.changes and "as many iterations" in control.title
     assert [row.name for row in paper.rows_of(BenchConfig(methods=("nearest_fill", "gs3d")), TABLES["mudg1"])] == ["gs3d"]
     ablation = [row.name for row in paper.rows_of(BenchConfig(), TABLES["mudg3"])]
     assert ablation == ["street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"]
@@ -458,11 +461,13 @@ def test_a_table_on_cities_end_to_end(filled):
     seed = document["logs"][0]["log"]
     assert (out / seed / "film" / "front_shift+3.0.jpg").is_file()
     before = {name: (out / seed / name / "run.json").stat().st_mtime_ns for name in ("fit/mudg_s", "virtual", "score/mudg_s")}
-    more = dataclasses.replace(config, methods=("gs3d", "mudg_s"))
+    more = dataclasses.replace(config, methods=("gs3d", LONGER, "mudg_s"))
     bench.run("paper", more, out, sources=("city:development",))
     assert {name: (out / seed / name / "run.json").stat().st_mtime_ns for name in before} == before
     rows = [row["name"] for row in store.read_json(out / "bench.json")["rows"]]
-    assert rows == ["truth", "nearest_fill", "gs3d", "mudg_s"]
+    assert rows == ["truth", "nearest_fill", "gs3d", LONGER, "mudg_s"]
+    control = store.read_json(out / seed / "fit" / LONGER / "run.json")
+    assert control["inputs"]["start"] == store.digest(out / seed / "fit" / "street_gaussians") and control["summary"]["steps"] == 10
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.bench import run as bench
 from mudg.bench import shift as bench_shift
 from mudg.bench import shift_page, shift_tables
+from mudg.bench.chain import LONGER
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import LogRules
@@ -110,6 +111,12 @@ def test_published_methods_are_rows_where_they_are_asked_for():
     assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
     assert not set(PUBLISHED) & set(BenchConfig().methods)
     assert set(PUBLISHED) < set(METHODS)
+
+
+def test_the_control_has_the_settings_of_the_first_fit():
+    rows = bench_shift.rows_of(BenchConfig(methods=("mudg_s", LONGER, "street_gaussians"), iterations=30))
+    assert [row.name for row in rows] == ["street_gaussians", LONGER, "mudg_s"]
+    assert rows[1].fit == rows[0].fit
 
 
 def test_unknown_methods_and_repeated_names_are_refused():
@@ -243,12 +250,12 @@ def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp
     log = out / str(city_logs.DEVELOPMENT[0])
     variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
     bench_shift.run(
-        dataclasses.replace(config, methods=("mudg_s",), videos=False, model=str(tmp_path / "model"), variant=variants), out,
+        dataclasses.replace(config, methods=("mudg_s", LONGER), videos=False, model=str(tmp_path / "model"), variant=variants), out,
         rules=TINY, distances_m=(3.0,), overwrite=True,
     )  # fmt: skip
-    states = {name: store.read_json(log / "fit" / name / "run.json") for name in ("mudg_s", "louder", "flat")}
+    states = {name: store.read_json(log / "fit" / name / "run.json") for name in ("mudg_s", LONGER, "louder", "flat")}
     first = store.digest(log / "fit" / "street_gaussians")
-    assert states["mudg_s"]["inputs"]["start"] == states["louder"]["inputs"]["start"] == first
+    assert states["mudg_s"]["inputs"]["start"] == states["louder"]["inputs"]["start"] == states[LONGER]["inputs"]["start"] == first
     assert states["flat"]["inputs"]["start"] == store.digest(log / "start" / "flat") != first
     assert not (log / "start" / "louder").exists()
     for state in states.values():

@@ -21,6 +21,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import is_temporary
 from mudg.core.raster.place import drawing_device
 from mudg.methods import METHODS
+from mudg.report.score_tables import title_of
 from mudg.stages import fit, synthesize
 from mudg.stages.config import BenchConfig, FitConfig, SynthesizeConfig
 from mudg.stages.run import WITHOUT_DIFFUSION, fits_of
@@ -36,6 +37,9 @@ VIRTUAL_TERMS: Final[dict[str, tuple[str, str, Mapping[str, float]]]] = {
 of the fit). Beside them stand street_gaussians (no virtual views) and mudg_s (all terms)."""
 
 
+LONGER: Final = f"{WITHOUT_DIFFUSION}-longer"
+"""The control of ``mudg_s``: goes on with the first fit for as many iterations, without generated views."""
+LONGER_TITLE: Final = title_of(WITHOUT_DIFFUSION) + ", as many iterations"
 REPAIRED: Final = "difix"
 REPAIR_STEPS: Final = 3
 """Steps in which repaired views move from the recorded path to the places of generated views."""

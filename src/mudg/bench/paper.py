@@ -21,7 +21,18 @@ from mudg.base.errors import UsageError
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import paper_numbers, paper_page, paper_sets, paper_text, shift_page
-from mudg.bench.chain import REPAIRED, FitChain, at_once, each_log, learns_virtual, made, refuse_foreign, seconds_of
+from mudg.bench.chain import (
+    LONGER,
+    LONGER_TITLE,
+    REPAIRED,
+    FitChain,
+    at_once,
+    each_log,
+    learns_virtual,
+    made,
+    refuse_foreign,
+    seconds_of,
+)
 from mudg.bench.paper_logs import ListedCity, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
 from mudg.bench.paper_tables import RECORDED, TABLES, PaperRow, PaperTable, further_columns
 from mudg.bench.shift import PERCEPTUAL_VIEWS, write_fill
@@ -38,7 +49,7 @@ from mudg.stages.config import (
     SynthesizeConfig,
     on_device,
 )
-from mudg.stages.run import CONTINUED_SHARE
+from mudg.stages.run import CONTINUED_SHARE, WITHOUT_DIFFUSION
 
 FILL, TRUTH = score.BASELINE, "truth"
 PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
@@ -146,14 +157,23 @@ def rows_of(config: BenchConfig, table: PaperTable) -> tuple[PaperRow, ...]:
                 "this table has rows of its own", where="--methods", expected="not given", got=", ".join(config.methods)
             )
         return table.rows
-    asked = tuple(METHODS) if config.methods == usual else tuple(name for name in config.methods if name != FILL)
-    unknown = sorted(set(asked) - set(METHODS))
+    known = with_control(tuple(METHODS))
+    asked = known if config.methods == usual else tuple(name for name in config.methods if name != FILL)
+    unknown = sorted(set(asked) - set(known))
     if unknown:
-        raise UsageError("unknown method", where="--methods", expected=", ".join(METHODS), got=", ".join(unknown))
+        raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
     own = {"freevs": {"condition": "freevs", "model": config.freevs_model}}
     if not mdm_files.uses_renders(config.model):
         own[REPAIRED] = {"model": ""}
-    return tuple(replace(row, changes=own.get(row.method, row.changes)) for row in table.rows_of(asked))
+    control = PaperRow(LONGER, f"{LONGER_TITLE} ({LONGER})", WITHOUT_DIFFUSION)
+    rows = {row.name: row for row in table.rows_of(tuple(name for name in asked if name != LONGER))} | {LONGER: control}
+    return tuple(replace(rows[name], changes=own.get(rows[name].method, rows[name].changes)) for name in asked)
+
+
+def with_control(methods: tuple[str, ...]) -> tuple[str, ...]:
+    """All methods, and after the one without diffusion the control that has as many iterations as those with it."""
+    after = methods.index(WITHOUT_DIFFUSION) + 1
+    return (*methods[:after], LONGER, *methods[after:])
 
 
 def score_settings(config: ScoreConfig, table: PaperTable) -> ScoreConfig:
@@ -269,13 +289,19 @@ def views_of(job: PaperJob, row: PaperRow, scene: Path, asked: Asked) -> tuple[P
             on_path = replace(asked.off_path, shifts_m=(0.0,), paths=(), **row.changes)
             found.append(_generated(job, on_path, scene, first, job.out / "generated" / f"{row.name}-{RECORDED}"))
         return tuple(found)
+    model, views = _fitted(job, row, scene, asked, fits), job.out / "render" / row.name
+    return (made(lambda o: render.run(asked.drawn, scene, model, views, overwrite=o), job.overwrite),)
+
+
+def _fitted(job: PaperJob, row: PaperRow, scene: Path, asked: Asked, fits: FitChain) -> Path:
+    if row.name == LONGER:
+        return fits.longer(row.name)
     settings = configuration.load(FitConfig, job.usual, overrides={"method": row.method, **row.changes})
     virtual: tuple[Path, ...] = ()
     if learns_virtual(settings):
         first = fits.first() if job.renders else None
         virtual = (_generated(job, asked.off_path, scene, first, job.out / "virtual"),)
-    model, views = fits.fitted(row.name, settings, virtual), job.out / "render" / row.name
-    return (made(lambda o: render.run(asked.drawn, scene, model, views, overwrite=o), job.overwrite),)
+    return fits.fitted(row.name, settings, virtual)
 
 
 def _generated(job: PaperJob, settings: SynthesizeConfig, scene: Path, fitted: Path | None, out: Path) -> Path:

@@ -28,7 +28,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, is_temporary, refuse_overlap
 from mudg.base.types import Scene
 from mudg.bench import real_measure, real_page, real_tables, real_truth
-from mudg.bench.chain import FitChain, at_once, learns_virtual, made
+from mudg.bench.chain import LONGER, LONGER_TITLE, FitChain, at_once, learns_virtual, made
 from mudg.bench.real_protocols import (
     PROTOCOLS,
     SPLITS,
@@ -60,8 +60,6 @@ from mudg.stages.config import (
 )
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, "street_gaussians", "mudg_r", "mudg_s"
-LONGER: Final = f"{BASE}-longer"
-"""The control of ``mudg_s``: as many iterations, no generated view."""
 VIRTUAL_SHIFTS_M: Final = SynthesizeConfig().shifts_m
 _PAGES: Final = ("bench.json", "bench.md", "page.html")
 _PART: Final = VerbOutput("part of a scene", 1, SCENE_FILES)
@@ -96,7 +94,7 @@ class RealMethod:
     def title(self) -> str:
         """For tables."""
         if self.longer:
-            return title_of(self.fit) + ", as many iterations"
+            return LONGER_TITLE
         if not self.sees or self.changes is not None:
             return title_of(self.name)
         return title_of(self.name.removesuffix(LESS[self.sees])) + _LESS_TITLES[self.sees]

@@ -25,6 +25,8 @@ from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Trajectory
 from mudg.bench import shift_page, shift_tables
 from mudg.bench.chain import (
+    LONGER,
+    LONGER_TITLE,
     VIRTUAL_TERMS,
     FitChain,
     at_once,
@@ -75,7 +77,8 @@ _EXACT_OUTPUT: Final = VerbOutput(EXACT, 1, below("*", OBSERVATION_FILES))
 
 @dataclass(frozen=True)
 class Row:
-    """A method to compare: its name in tables and folders, its title, and the settings of its fit (None = no fit)."""
+    """A method to compare: its name in tables and folders, its title, and the settings of its fit (None = no fit; those of the first fit
+    where it is ``LONGER``)."""
 
     name: str
     title: str
@@ -163,17 +166,21 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     Raises:
         UsageError: an unknown method, or a malformed or repeated variant.
     """
-    known = (FILL, "gs3d", WITHOUT, *PUBLISHED, DIFFUSION, WITH)
+    known = (FILL, "gs3d", WITHOUT, LONGER, *PUBLISHED, DIFFUSION, WITH)
     wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
     if not wanted or wanted - set(known):
         raise UsageError("unknown method", where="--methods", expected=", ".join(known),
             got=", ".join(sorted(wanted - set(known))))  # fmt: skip
     plain = usual_fit(config)
+    titles, methods = {LONGER: LONGER_TITLE}, {LONGER: WITHOUT}
     rows = [
-        Row(name, title_of(name), None if name in GENERATED else configuration.load(FitConfig, plain, overrides={"method": name}))
+        Row(
+            name, titles.get(name, title_of(name)),
+            None if name in GENERATED else configuration.load(FitConfig, plain, overrides={"method": methods.get(name, name)}),
+        )
         for name in known
         if name in wanted
-    ]
+    ]  # fmt: skip
     if config.ablation:
         for name, (description, weights) in ABLATION.items():
             rows.append(Row(name, f"with {description}", configuration.load(FitConfig, plain, overrides={"virtual": weights})))
@@ -268,7 +275,8 @@ def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajec
         raise UsageError("a method without views", got=row.name)
     if row.name == EXACT:
         painted = made(lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o), job.overwrite)
-    model, views = job.fits.fitted(row.name, settings, (painted,)), job.out / "render" / row.name
+    model = job.fits.longer(row.name) if row.name == LONGER else job.fits.fitted(row.name, settings, (painted,))
+    views = job.out / "render" / row.name
     return made(lambda o: render.run(drawn, scene, model, views, overwrite=o), job.overwrite)
 
 

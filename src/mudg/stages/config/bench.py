@@ -48,9 +48,10 @@ class BenchConfig:
     logs: int = Field(default=8, ge=1, le=8)
     """shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
-    """shift, real: methods to compare: those of the default, and pvg, s3gaussian, bezier, omnire, emernerf and difix. real also has
-    mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and
-    with points alone in its input. paper: any method of `mudg fit`, and mudg_r; with the default, all of them."""
+    """shift, real: methods to compare: those of the default; pvg, s3gaussian, bezier, omnire, emernerf and difix; and
+    street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt,
+    mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone
+    in its input. paper: any of these of shift, and freevs; with the default, all of them."""
     iterations: int = Field(default=1000, ge=1)
     """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
     ablation: bool = False
