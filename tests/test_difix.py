@@ -77,12 +77,15 @@ def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with
     done: list[tuple] = []
 
     def repaired(config, scene, fused, out, *, fitted, overwrite):
-        done.append(("repair", config.shifts_m, fitted.relative_to(tmp_path).as_posix()))
+        done.append(("repair", config.shifts_m, "/".join(fitted.parts[-2:])))
+        for shift in config.shifts_m:
+            (out / f"front_shift{shift:+.1f}").mkdir(parents=True)
+            (out / f"front_shift{shift:+.1f}" / "observations.json").write_text("{}")
         return out
 
     def fitted(config, scene, fused, out, *, observations, start, overwrite):
-        begun = None if start is None else start.relative_to(tmp_path).as_posix()
-        done.append((config.method, config.iterations, [path.name for path in observations], begun))
+        begun = None if start is None else "/".join(start.parts[-2:])
+        done.append((config.method, config.iterations, ["/".join(path.parts[-2:]) for path in observations], begun))
         return out
 
     monkeypatch.setattr(chain.synthesize, "run", repaired)
@@ -90,10 +93,17 @@ def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with
     usual = FitConfig(method="mudg_s", iterations=100)
     fits = FitChain(tmp_path, tmp_path / "scene", tmp_path / "fuse", usual, False, SynthesizeConfig(shifts_m=(3.0,)))
     assert fits.fitted("difix", replace(usual, method="difix"), ()) == tmp_path / "fit" / "difix"
+    first = "fit/street_gaussians"
     assert [entry for entry in done if entry[0] != "street_gaussians"] == [
-        ("repair", (1.0,), "fit/street_gaussians"), ("difix", 50, ["1"], "fit/street_gaussians"),
-        ("repair", (2.0,), "start/difix-1"), ("difix", 50, ["1", "2"], "fit/street_gaussians"),
-        ("repair", (3.0,), "start/difix-2"), ("difix", 50, ["1", "2", "3"], "fit/street_gaussians"),
+        ("repair", (1.0,), first), ("difix", 50, ["1/front_shift+1.0"], first),
+        ("repair", (2.0,), "start/difix-1"), ("difix", 50, ["1/front_shift+1.0", "2/front_shift+2.0"], first),
+        ("repair", (3.0,), "start/difix-2"), ("difix", 50, ["1/front_shift+1.0", "2/front_shift+2.0", "3/front_shift+3.0"], first),
+    ]  # fmt: skip
+    many = replace(fits, out=tmp_path / "many", generator=SynthesizeConfig(shifts_m=(2.0, 3.0, 4.0)))
+    many.fitted("difix", replace(usual, method="difix"), ())
+    assert done[-1][2] == [  # steps two and three pass places of the step before: the newer views count, once
+        "1/front_shift+0.7", "1/front_shift+1.0", "2/front_shift+1.3", "3/front_shift+2.0", "2/front_shift+2.7", "3/front_shift+3.0",
+        "3/front_shift+4.0",
     ]  # fmt: skip
     with pytest.raises(UsageError, match="settings of generated"):
         replace(fits, generator=None).fitted("difix", replace(usual, method="difix"), ())

@@ -275,13 +275,14 @@ def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_pa
     names = sorted(path.name for path in world["virtual"].iterdir())
     for name in names:
         shutil.copytree(world["virtual"] / name, tmp_path / f"of {name}" / name)
-    several = [tmp_path / f"of {name}" for name in names]
+    several = [tmp_path / f"of {name}" if number else world["virtual"] / name for number, name in enumerate(names)]
     arguments = (settings("mudg_s", iterations=4, virtual__start=0.0), world["scene"], world["fuse"])
     together = fit.run(*arguments, tmp_path / "together", observations=world["virtual"])
     apart = fit.run(*arguments, tmp_path / "apart", observations=several)
     assert fitted_bytes(apart) == fitted_bytes(together)
     with pytest.raises(InputError, match=r"same name[\s\S]*front_shift"):
         fit.run(*arguments, tmp_path / "twice", observations=[world["virtual"], several[0]])
+    assert len(names) > 1
     assert not (tmp_path / "twice").exists()
 
 

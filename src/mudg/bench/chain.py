@@ -20,6 +20,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import is_temporary
 from mudg.core.raster.place import drawing_device
+from mudg.data.observations import list_observation_sets
 from mudg.methods import METHODS
 from mudg.report.score_tables import title_of
 from mudg.stages import fit, synthesize
@@ -162,18 +163,19 @@ class FitChain:
 
     def _repaired(self, name: str, settings: FitConfig) -> Path:
         """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired so far. Every
-        fit goes on with the first one."""
+        fit goes on with the first one. Where steps pass the same place (2 m is the end of the way to 2 m, and two thirds of that to
+        3 m), the newest views count."""
         if self.generator is None:
             raise UsageError("repaired views need settings of generated ones", got=name)
-        model, seen = self.first(), []
+        model, seen = self.first(), {}
         settings = replace(fits_of(settings)[1], method=settings.method)
         for step in range(1, REPAIR_STEPS + 1):
             views, last = self.out / "repair" / str(step), step == REPAIR_STEPS
             asked = repair_settings(self.generator, step / REPAIR_STEPS)
             made(lambda o, m=model, v=views, a=asked: synthesize.run(a, self.scene, self.fused, v, fitted=m, overwrite=o), self.overwrite)
-            seen.append(views)
+            seen |= list_observation_sets(views)
             out = self.out / "fit" / name if last else self.out / "start" / f"{name}-{step}"
-            model = self._made(settings, out, tuple(seen), self.first())
+            model = self._made(settings, out, tuple(seen.values()), self.first())
         return model
 
     def _made(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:

@@ -184,5 +184,7 @@ def _camera(record: Any, where: str) -> Camera:
 
 
 def list_observation_sets(path: Path) -> dict[str, Path]:
-    """Trajectory folders below ``path``, by name."""
-    return {p.name: p for p in sorted(Path(path).iterdir()) if (p / _INDEX).is_file()} if Path(path).is_dir() else {}
+    """Trajectory folders below ``path``, by name; ``path`` itself if it is one."""
+    path = Path(path)
+    places = [path] if (path / _INDEX).is_file() else sorted(path.iterdir()) if path.is_dir() else []
+    return {p.name: p for p in places if (p / _INDEX).is_file()}

@@ -270,7 +270,7 @@ def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], do
 
 
 def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
-    """The sets of virtual observations below some folders, by name; only their indices are read.
+    """The sets of virtual observations in some folders, of all trajectories or of one, by name; only their indices are read.
 
     Raises:
         InputError: a folder has none, two have sets of one name, or one of them holds recorded views.
