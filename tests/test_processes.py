@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mudg.base.errors import NumericsError
-from mudg.base.processes import Interruption, calls_beside, error_from_record, error_record, process_alive
+from mudg.base.processes import Interruption, calls_beside, error_from_record, error_record, process_alive, run_in_processes
 
 PATIENCE_S = 60.0
 
@@ -46,6 +46,28 @@ def sleep_long(folder: Path) -> None:
     """Says which process it is, and works for longer than any test waits."""
     (folder / "started").write_text(str(os.getpid()))
     time.sleep(600)
+
+
+def begin_and_fail(folder: Path, fails: bool) -> None:
+    """Says that it has begun; one call fails at once, the others take a moment."""
+    (folder / "begun").write_text("")
+    if fails:
+        raise NumericsError("a loss is not finite")
+    time.sleep(0.5)
+
+
+def test_after_an_error_no_call_begins_any_more(tmp_path: Path) -> None:
+    places = folders(tmp_path, *"abcdef")
+    with pytest.raises(NumericsError, match="not finite"):
+        list(run_in_processes(begin_and_fail, [(place, place.name == "a") for place in places], 2))
+    assert {place.name for place in places if (place / "begun").exists()} <= {"a", "b"}
+
+
+def test_calls_end_in_any_order_and_all_are_told(tmp_path: Path) -> None:
+    places = folders(tmp_path, *"abcde")
+    assert sorted(run_in_processes(begin_and_fail, [(place, False) for place in places], 3)) == [(n, None) for n in range(5)]
+    assert all((place / "begun").exists() for place in places)
+    assert list(run_in_processes(begin_and_fail, [], 2)) == []
 
 
 def test_workers_of_a_parent_that_is_killed_end(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import itertools
 import multiprocessing
 import multiprocessing.process
 import os
@@ -201,8 +202,7 @@ def run_in_processes(
     with child_environment(1):
         pool = process_pool(processes)
         try:
-            futures = {pool.submit(_stoppable, function, items): index for index, items in enumerate(arguments)}
-            yield from _as_completed(pool, futures)
+            yield from _in_turn(pool, function, arguments, processes)
         except (KeyboardInterrupt, GeneratorExit):
             _stop(pool)
             raise
@@ -257,17 +257,38 @@ def calls_beside(function: Callable[..., object], arguments: Sequence[tuple[Any,
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _as_completed(
-    pool: concurrent.futures.ProcessPoolExecutor, futures: Mapping[concurrent.futures.Future[Result], int]
+def _in_turn(
+    pool: concurrent.futures.ProcessPoolExecutor, function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[tuple[int, Result]]:
-    """Results as they come. The pool itself does not notice every death: its own threads can be short of memory, too."""
+    """Results as they come. No more calls are handed out than there are processes: the pool cannot take back one that waits in its
+    queue, and after an error it would still be begun."""
+    futures: dict[concurrent.futures.Future[Result], int] = {}
+    rest = iter(enumerate(arguments))
+
+    def hand_out(count: int) -> list[concurrent.futures.Future[Result]]:
+        given = [(pool.submit(_stoppable, function, items), index) for index, items in itertools.islice(rest, count)]
+        futures.update(given)
+        return [future for future, _ in given]
+
+    hand_out(processes)
+    return _as_completed(pool, futures, lambda: hand_out(1))
+
+
+def _as_completed(
+    pool: concurrent.futures.ProcessPoolExecutor, futures: Mapping[concurrent.futures.Future[Result], int],
+    next_of: Callable[[], Sequence[concurrent.futures.Future[Result]]] = tuple,
+) -> Iterator[tuple[int, Result]]:
+    """Results as they come; ``next_of`` hands out what takes the place of a call that has ended well. The pool itself does not notice
+    every death: its own threads can be short of memory, too."""
     waiting, dead_for = set(futures), 0
     while waiting:
         done, waiting = concurrent.futures.wait(waiting, _POLL_S, concurrent.futures.FIRST_COMPLETED)
         for future in done:
             if isinstance(future.exception(), KeyboardInterrupt):
                 raise BrokenProcessPool("a worker was stopped")
-            yield futures[future], future.result()
+            result = future.result()
+            waiting.update(next_of())
+            yield futures[future], result
         dead_for = dead_for + 1 if not done and any(not one.is_alive() for one in _members(pool)) else 0
         if dead_for > _NOTICED_AFTER:
             raise BrokenProcessPool("a worker is gone")
