@@ -13,7 +13,14 @@ from pathlib import Path
 import pytest
 
 from mudg.base.errors import NumericsError
-from mudg.base.processes import Interruption, calls_beside, error_from_record, error_record, process_alive, run_in_processes
+from mudg.base.processes import (
+    Interruption,
+    calls_beside,
+    error_from_record,
+    error_record,
+    process_alive,
+    run_in_processes,
+)
 
 PATIENCE_S = 60.0
 
