@@ -119,18 +119,27 @@ def work_with_cleanup(folder: Path) -> None:
         (folder / "tidy").touch()
 
 
+def fail_soon(folder: Path) -> None:
+    """Fails when the other call has begun."""
+    (folder / "started").write_text(str(os.getpid()))
+    wait_for(folder.parent / "1cleanup" / "started")
+    raise NumericsError("a loss is not finite")
+
+
 def call(name: str, folder: Path) -> None:
     """One of the calls above, or one that must not begin."""
-    {"steps": work_in_steps, "cleanup": work_with_cleanup, "never": sleep_long}[name](folder)
+    {"steps": work_in_steps, "cleanup": work_with_cleanup, "never": sleep_long, "fails": fail_soon}[name](folder)
 
 
 IN_TURN = "for _ in run_in_processes(t.call, calls, 2):\n        pass"
 BESIDE = "with calls_beside(t.call, calls, 2):\n        time.sleep(600)"
 
 
-def stopped_command(tmp_path: Path, number: int, *, group: bool, calling: str = IN_TURN) -> tuple[int, str, list[int]]:
-    """A command with two workers, two calls that run and three that wait, is sent a signal: exit code, what it said, workers."""
-    names = ["steps", "cleanup", "never", "never", "never"]
+def stopped_command(
+    tmp_path: Path, number: int, *, group: bool, calling: str = IN_TURN, first: str = "steps", after_s: float = 0.2
+) -> tuple[int, str, list[int]]:
+    """A command with two workers, two calls that have begun and three that wait, is sent a signal: exit code, what it said, workers."""
+    names = [first, "cleanup", "never", "never", "never"]
     given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
     script = (
         "import signal, sys, time; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\n"
@@ -153,7 +162,7 @@ def stopped_command(tmp_path: Path, number: int, *, group: bool, calling: str = 
         try:
             wait_for(given[0] / "started")
             wait_for(given[1] / "started")
-            time.sleep(0.2)
+            time.sleep(after_s)
             os.killpg(parent.pid, number) if group else os.kill(parent.pid, number)
             said = parent.communicate(timeout=PATIENCE_S)[1]
         finally:
@@ -174,6 +183,15 @@ def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int
     assert (tmp_path / "0steps" / "checkpoint").exists()
     assert (tmp_path / "1cleanup" / "tidy").exists()
     assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
+    assert not any(process_alive(worker) for worker in workers)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
+def test_a_command_that_is_stopped_after_an_error_stops_its_workers(tmp_path: Path) -> None:
+    """While it waits for the calls that still run."""
+    got, said, workers = stopped_command(tmp_path, signal.SIGTERM, group=False, first="fails", after_s=2.0)
+    assert got == 143, said
+    assert (tmp_path / "1cleanup" / "tidy").exists()
     assert not any(process_alive(worker) for worker in workers)
 
 

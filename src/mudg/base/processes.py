@@ -211,7 +211,11 @@ def run_in_processes(
             pool.shutdown(wait=False, cancel_futures=True)
             raise ended_process(str(error)) from error
         except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
+            try:
+                pool.shutdown(wait=True, cancel_futures=True)
+            except KeyboardInterrupt:  # stopped while the other calls end
+                _stop(pool)
+                raise
             raise
         pool.shutdown()
 
