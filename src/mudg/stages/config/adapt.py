@@ -24,6 +24,9 @@ class AdaptConfig:
     """Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate the photographs."""
     gaps: bool = True
     """Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the other half."""
+    cameras_left_out: tuple[str, ...] = ()
+    """Cameras that give one more lesson each: to generate their photographs from those of all other cameras alone, at the pixels that
+    these saw (empty = no such lesson)."""
     block: int = Field(default=4, ge=1)
     """Frames per training clip, and consecutive frames left out together."""
     held_out_every: int = Field(default=4, ge=2)
