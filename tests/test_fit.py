@@ -369,7 +369,7 @@ def test_fused_points_give_depth_beside_the_path(world):
     assert car.sum() > 5 and relative[car].median() < 0.05
 
 
-@pytest.mark.parametrize("changes", [{"lidar_weight": 0.0}, {"ssim_weight": 0.0}, {"densify": True}, {"hold_ground": True}])
+@pytest.mark.parametrize("changes", [{"lidar_weight": 0.0}, {"ssim_weight": 0.0}, {"densify": True}])
 def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path, changes):
     usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [

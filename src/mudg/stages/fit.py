@@ -58,7 +58,6 @@ from mudg.stages.fitting.continued import (
     whole_run,
 )
 from mudg.stages.fitting.finite import FiniteCheck
-from mudg.stages.fitting.ground import ground_held, warn_without_ground
 from mudg.stages.fitting.halved import HalvedViews
 from mudg.stages.fitting.kept import chosen_ahead, keep, recorded_bytes, scratch_folder, virtual_bytes
 from mudg.stages.fitting.objects import boxes_in_view, objects_only
@@ -306,8 +305,6 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     raster, perception = raster_of(state.model, config.raster, config.drawing.packed), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
-    if config.virtual.hold_ground and state.views.virtual:
-        warn_without_ground(state.model)
     sizes = HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
 
     def choose(step: int) -> tuple[StoredView, ...]:
@@ -393,8 +390,7 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
     with_classes = not recorded or step % config.loss.semantic_every == 0
     gaussians = compose(model, view.view.time_s, with_classes)
     pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None
-    drawn = gaussians if recorded or not config.virtual.hold_ground else ground_held(model, gaussians)
-    render = rasterize(drawn, view.view, raster, absgrad=growing, world_from_cam=pose)
+    render = rasterize(gaussians, view.view, raster, absgrad=growing, world_from_cam=pose)
     if recorded:
         terms = recorded_terms(state, render, view, recipe.common(config))
         terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))

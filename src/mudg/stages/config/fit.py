@@ -159,9 +159,6 @@ class VirtualConfig:
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
     densify: bool = False
     """Let virtual views also decide where Gaussians are added."""
-    hold_ground: bool = False
-    """Virtual views do not move Gaussians of the ground (road, sidewalk, terrain), nor change their size or rotation; they still learn
-    colours and opacity from them."""
     confidence_power: float = Field(default=0.5, ge=0)
     """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all pixels count
     the same)."""
