@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import shutil
@@ -249,6 +250,24 @@ def test_a_disk_that_fills_up_is_an_error_in_words(tmp_path, monkeypatch):
     monkeypatch.setattr(scratch.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", buffering=0))
     with pytest.raises(ResourceError, match=r"writing failed[\s\S]*No space left[\s\S]*free disk space"):
         scratch.ScratchFile(tmp_path).append(np.zeros(100, np.uint8))
+
+
+def test_a_mapped_array_keeps_its_values_and_has_no_name(tmp_path):
+    array = scratch.mapped_array(tmp_path, (3, 5000), np.float32)
+    assert not array.any()
+    array[:] = np.arange(15000).reshape(3, 5000)
+    scratch.rest_mapped()
+    assert np.array_equal(array, np.arange(15000).reshape(3, 5000))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_path, monkeypatch):
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(scratch.os, "posix_fallocate", full, raising=False)
+    with pytest.raises(ResourceError, match=r"cannot make a scratch file[\s\S]*No space left"):
+        scratch.mapped_array(tmp_path, (100,), np.uint8)
 
 
 # ---- whole fits ------------------------------------------------------------------------------------------------------

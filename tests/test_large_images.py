@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -43,6 +44,18 @@ def test_bands_give_the_distance_of_the_whole(height: int, width: int, masked: b
     for rows in (8, 24, 64, 1000):
         monkeypatch.setattr(featnets, "BAND_PIXELS", rows * width)
         assert distance(pair) == pytest.approx(whole, rel=2e-6)
+
+
+def test_several_images_are_compared_with_features_of_the_truth_that_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, distance = pair_of(136, 40, masked=True), small_distance()
+    pairs = [replace(first, rgb=image) for image in torch.rand(3, 3, 136, 40, generator=torch.Generator().manual_seed(5))]
+    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
+    monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
+    alone = [distance(pair) for pair in pairs]
+    made, forward = [], CodecFeatures.forward
+    monkeypatch.setattr(CodecFeatures, "forward", lambda self, rgb: made.append(rgb) or forward(self, rgb))
+    assert distance.of_all(pairs, 1) == distance.of_all(pairs, 3) == alone
+    assert len(made) == 2 * 6 * (len(pairs) + 1)  # six bands
 
 
 def test_bands_are_not_the_whole_without_what_lies_around_them(monkeypatch: pytest.MonkeyPatch) -> None:

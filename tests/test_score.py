@@ -15,6 +15,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.pictures import resize_nearest
+from mudg.models import featnets
 from mudg.report import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
@@ -186,6 +187,20 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
     second = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "two")
     for name in ("metrics.json", "metrics.md", "errors/front_recorded.png"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+def test_large_images_score_as_small_ones_do(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views one after the other and methods beside each other, perceptual distances in bands; the images are not halved."""
+    views = {name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name))) for name in ("a", "bb")}
+    small = store.read_json(score.run(ScoreConfig(), scene, views, tmp_path / "small") / "metrics.json")["results"]
+    monkeypatch.setattr(score, "WHOLE_PIXELS", 0)
+    monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
+    large = store.read_json(score.run(ScoreConfig(), scene, views, tmp_path / "large") / "metrics.json")["results"]
+    assert [one["method"] for one in small] == [one["method"] for one in large] == ["a", "bb"]
+    for one, other in zip(small, large, strict=True):
+        assert isinstance(one["values"]["perceptual"], float)
+        assert one["values"].pop("perceptual") == pytest.approx(other["values"].pop("perceptual"), abs=2e-6)  # rounded to six places
+        assert one == other
 
 
 def test_distances_average_both_sides_and_mark_the_best() -> None:

@@ -9,11 +9,11 @@ from fit_settings import fit_config
 from toy_scene import ToyStreet
 
 from mudg import cli
-from mudg.base import palette
+from mudg.base import palette, scratch
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
 from mudg.core import trajectory
-from mudg.data.clips import condition
+from mudg.data.clips import condition, stacked
 from mudg.data.observations import list_observation_sets, read_observations
 from mudg.data.scene import read_scene
 from mudg.models.mdm import files
@@ -130,6 +130,20 @@ def test_prepared_images_are_kept_exactly():
         images[number] = condition.WarpSource(view, rgb, flat, flat > 2, flat.byte())
         assert torch.equal(images[number].rgb, rgb)
     assert dict.__getitem__(images, 0).rgb.dtype == torch.uint8
+
+
+def test_conditions_in_files_change_nothing(world, tmp_path, monkeypatch):
+    usual = made(world, tmp_path / "usual", full_size=True)
+    mapped, map_array = [], scratch.mapped_array
+    monkeypatch.setattr(stacked, "LARGE_PIXELS", 0)
+    monkeypatch.setattr(scratch, "mapped_array", lambda folder, *asked: mapped.append(folder) or map_array(folder, *asked))
+    filed = made(world, tmp_path / "filed", full_size=True)
+    assert set(mapped) == {filed}
+    assert sorted(p.relative_to(filed) for p in filed.rglob("*")) == sorted(p.relative_to(usual) for p in usual.rglob("*"))
+    for a, b in zip(frames_of(usual / "front_shift+1.0"), frames_of(filed / "front_shift+1.0"), strict=True):
+        assert torch.equal(a.rgb, b.rgb)
+        assert torch.equal(a.depth.nan_to_num(), b.depth.nan_to_num())
+        assert torch.equal(a.semantics, b.semantics)
 
 
 def test_full_size_views_have_the_cameras_size(world, tmp_path):

@@ -438,8 +438,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words[0] in ("-V", "--version"):
             _say(f"mudg {version()}")
             return 0
-        # Idle OpenMP threads that spin would take the cores from the native library's threads; must precede torch.
+        # Idle threads of OpenMP and of numpy's BLAS that spin would take the cores from others; must precede torch and numpy.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a wrong flag is told in our words
         addresses = any("://" in word for word in words)
         if addresses:

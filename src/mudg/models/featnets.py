@@ -19,8 +19,9 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal, NamedTuple
 
 import torch
@@ -28,7 +29,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, UsageError
 from mudg.core.metrics import Pair
 from mudg.core.native_ops import box_mean
 from mudg.core.perceptual import distance_places, lpips_distance, unit_features
@@ -372,10 +373,8 @@ class PerceptualDistance:
         """The distance, or None where colour is missing."""
         if pair.rgb is None or pair.truth_rgb is None:
             return None
-        height, width = pair.rgb.shape[-2:]
-        if height * width > WHOLE_PIXELS and isinstance(self._features, CodecFeatures):
-            mask = None if pair.mask is None else reduced(pair.mask.float())
-            return self._in_bands(self._features, reduced(pair.rgb), reduced(pair.truth_rgb), mask)
+        if self.in_bands(pair):
+            return self.of_all([pair], 1)[0]
         with torch.no_grad():
             if getattr(self._known, "image", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
@@ -384,26 +383,67 @@ class PerceptualDistance:
             distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
             return float(distance)
 
+    def in_bands(self, pair: Pair) -> bool:
+        """Whether images of this size are compared band by band: no machine should hold all features of them at once."""
+        if pair.rgb is None or pair.truth_rgb is None or not isinstance(self._features, CodecFeatures):
+            return False
+        return pair.rgb.shape[-2] * pair.rgb.shape[-1] > WHOLE_PIXELS
+
+    def of_all(self, pairs: Sequence[Pair], threads: int) -> list[float]:
+        """The distances of large images (``in_bands``) from one truth, whose features are made once for all of them.
+
+        Args:
+            pairs: of one truth and mask. threads: bands that are worked on at the same time; the values do not depend on it.
+        """
+        network, truth, mask = self._features, pairs[0].truth_rgb, pairs[0].mask
+        if truth is None or not isinstance(network, CodecFeatures):
+            raise UsageError("only distances in the features of the codec are made band by band", where="PerceptualDistance.of_all")
+        images = [reduced(pair.rgb) for pair in pairs if pair.rgb is not None]
+        given = _Compared(network, self._device, images, reduced(truth), None if mask is None else reduced(mask.float()))
+        height, width = given.truth.shape[-2:]
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(given.sums_of, _bands(height, width, network)))
+        return [_mean_of_stages(bands) for bands in zip(*parts, strict=True)]
+
+
+def _mean_of_stages(bands: Sequence[Sequence[tuple[float, float]]]) -> float:
+    """The distance of one image from sums of distances and weights by band and stage."""
+    stages = [[sum(numbers) for numbers in zip(*stage, strict=True)] for stage in zip(*bands, strict=True)]
+    return sum(apart / weight if weight else math.nan for apart, weight in stages) / len(stages)
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Images that are held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H, W]."""
+
+    network: CodecFeatures
+    device: torch.device
+    images: Sequence[Tensor]
+    truth: Tensor
+    mask: Tensor | None
+    shares: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+
     @torch.no_grad()
-    def _in_bands(self, network: CodecFeatures, rgb: Tensor, truth: Tensor, mask: Tensor | None) -> float:
-        """The distance of large images, of which no machine should hold all features at once: sums over bands of rows."""
-        sums: list[list[float]] = []
-        shares: dict[tuple[int, int], Tensor] = {}
-        height, width = rgb.shape[-2:]
-        for band in _bands(height, width, network):
-            made, true = (band.features(network, image.to(self._device)) for image in (rgb, truth))
-            for stage, (features, target) in enumerate(zip(made, unit_features(true), strict=True)):
-                places = distance_places(features, target)
-                per_row = _places(features.shape[-2], band.ends - band.begins, network.STEP)
-                if mask is None:
-                    share = places.new_ones(())
-                else:
-                    size = (_padded(height, network.STEP) // per_row, features.shape[-1])
-                    if size not in shares:
-                        shares[size] = F.adaptive_avg_pool2d(mask.to(self._device, torch.float32), size)[0]
-                    share = shares[size][band.begins // per_row :][: features.shape[-2]]
-                if stage == len(sums):
-                    sums.append([0.0, 0.0])
-                sums[stage][0] += float((places * share).double().sum())
-                sums[stage][1] += float(share.expand_as(places).double().sum())
-        return sum(distance / weight if weight else math.nan for distance, weight in sums) / len(sums)
+    def sums_of(self, band: _Band) -> list[list[tuple[float, float]]]:
+        """Of every image and stage: sum of the weighted distances in a band, and of the weights."""
+        true = unit_features(band.features(self.network, self.truth.to(self.device)))
+        shares = [self._share(band, features) for features in true]
+        return [
+            [
+                (float((places * share).double().sum()), float(share.expand_as(places).double().sum()))
+                for features, target, share in zip(band.features(self.network, image.to(self.device)), true, shares, strict=True)
+                for places in [distance_places(features, target)]
+            ]
+            for image in self.images
+        ]
+
+    def _share(self, band: _Band, features: Tensor) -> Tensor:
+        """Weight of every place of a stage's features in a band."""
+        if self.mask is None:
+            return features.new_ones(())
+        step, height = self.network.STEP, self.truth.shape[-2]
+        per_row = _places(features.shape[-2], band.ends - band.begins, step)
+        size = (_padded(height, step) // per_row, features.shape[-1])
+        if size not in self.shares:
+            self.shares[size] = F.adaptive_avg_pool2d(self.mask.to(self.device, torch.float32), size)[0]
+        return self.shares[size][band.begins // per_row :][: features.shape[-2]]

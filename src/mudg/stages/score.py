@@ -307,13 +307,31 @@ def _measured(
         facts = reference.facts.of(view, truth)
     compared = {**seen, **({} if truth is None else {TRUTH: truth.seen})}
 
-    def measure(name: str) -> dict[str, Any]:
-        return metrics.measure(pair_of(compared[name], truth, view, facts), wanted[name])
-
     if _is_small(trajectory):  # whose views are measured at the same time
-        return MeasuredView(truth, facts, seen, {name: measure(name) for name in compared})
+        return MeasuredView(
+            truth, facts, seen,
+            {name: metrics.measure(pair_of(one, truth, view, facts), wanted[name]) for name, one in compared.items()},
+        )  # fmt: skip
+    pairs = {name: pair_of(one, truth, view, facts) for name, one in compared.items()}
+    known = _in_bands(pairs, wanted)
     with ThreadPoolExecutor(native.threads()) as pool:
-        return MeasuredView(truth, facts, seen, dict(zip(compared, pool.map(measure, compared), strict=True)))
+        found = pool.map(lambda name: metrics.measure(pairs[name], wanted[name], known.get(name)), pairs)
+        return MeasuredView(truth, facts, seen, dict(zip(pairs, found, strict=True)))
+
+
+def _in_bands(
+    pairs: Mapping[str, metrics.Pair], wanted: Mapping[str, Mapping[str, metrics.Metric]]
+) -> dict[str, dict[Callable[[metrics.Pair], Any], Any]]:
+    """What is measured of all methods together, for the features of the truth are made once then: by method, source -> value."""
+    found: dict[str, dict[Callable[[metrics.Pair], Any], Any]] = {name: {} for name in pairs}
+    sources = {metric.source: None for of in wanted.values() for metric in of.values()}
+    for source in sources:
+        if not isinstance(source, PerceptualDistance):
+            continue
+        asked = [n for n, pair in pairs.items() if source in {m.source for m in wanted[n].values()} and source.in_bands(pair)]
+        for name, value in zip(asked, source.of_all([pairs[n] for n in asked], native.threads()) if asked else (), strict=True):
+            found[name][source] = value
+    return found
 
 
 def evenly(items: Sequence[int], count: int) -> list[int]:

@@ -40,6 +40,7 @@ from mudg.core.raster.cpu import release_memory
 from mudg.data.clips.ablated import ConditionParts, ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules, WarpSource
 from mudg.data.clips.near_points import NearSweeps
+from mudg.data.clips.stacked import KeptImages
 from mudg.data.clips.vacated import VacatedAt
 from mudg.data.clips.weathered import InWeather
 from mudg.data.cloudfile import read_fused
@@ -73,7 +74,7 @@ EDITED_IMAGES_PER_VIEW = 24
 PROCESS_BYTES = int(1.2 * memory.GIB)
 PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
 """What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's frames. Measured:
-2.0 GiB at 1242x375 with windows of eight frames, 4.5 GiB at 3840x2160 with three."""
+2.0 GiB at 1242x375 with windows of eight frames, 3.85 GiB at 3840x2160 with three, where conditions lie in files (4.5 GiB before)."""
 WINDOW_FRAMES = 8
 COMPUTE = ("offload", "compiled")
 """Settings that say how is computed, not what: a result may be resumed and reused under others."""
@@ -253,7 +254,7 @@ def make_trajectory(
     if (folder / "observations.json").is_file():
         return len(path)
     model = model or loading.load_any(config)
-    maker = _view_maker(config, given, path, model)
+    maker = _view_maker(config, given, path, model, out)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
@@ -324,8 +325,10 @@ _drive_again = functools.lru_cache(maxsize=1)(_drive_of)
 """The same for the next trajectory of a run; ``run`` forgets it."""
 
 
-def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel) -> ViewMaker:
-    """What makes the views of one trajectory."""
+def _view_maker(
+    config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel, scratch: Path
+) -> ViewMaker:
+    """What makes the views of one trajectory; ``scratch``: a folder for what is large."""
     drive = _drive_again(config, given) if given.script is None else _drive_of(config, given)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
@@ -338,7 +341,7 @@ def _view_maker(config: SynthesizeConfig, given: JobInputs, path: Trajectory, mo
     sources = ConditionSources(
         drive.cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
     )
-    return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages()))
+    return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages(scratch)))
 
 
 def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
@@ -349,7 +352,7 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
 
 
-class PreparedImages(dict[int, WarpSource]):
+class PreparedImages(KeptImages):
     """Images made ready for warping, for all windows and trajectories that a process makes; colours as bytes where that is exact."""
 
     def __setitem__(self, number: int, image: WarpSource) -> None:

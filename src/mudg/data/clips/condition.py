@@ -20,7 +20,7 @@ Training clips are made of these in `from_city.py` and `from_log.py`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -31,7 +31,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional
 
-from mudg.base import geometry, palette
+from mudg.base import geometry, palette, scratch
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Condition, FusedCloud, Photo, Track, View
@@ -39,6 +39,7 @@ from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import seen_pixels
+from mudg.data.clips.stacked import KeptImages, stacked
 from mudg.data.clips.vacated import Vacated, VacatedAt, continued, determined, ground_behind, uncertain_there
 
 
@@ -305,7 +306,8 @@ def build_conditions(
     Args:
         cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
         recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
-        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views.
+        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views. Of
+            `KeptImages` with a folder, fine conditions of large views lie in files.
         render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
             (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
         vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
@@ -329,9 +331,10 @@ def build_conditions(
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
     points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
+    folder = sources.folder if isinstance(sources, KeptImages) else None
     made = (_condition_of_view(points, view, recorded, rules, sources) for view in fine_views)
     rows = ((*part, *(() if render_at is None else _planes(shown))) for part, shown in made)
-    color, depth, valid, warped, backdrop, ids, far_ids, *planes = _stacked(rows, len(fine_views))
+    color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
     fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
                      warped, backdrop, ids, far_ids, renders)  # fmt: skip
@@ -351,6 +354,7 @@ def build_conditions(
     small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders), vacated_at)
     own = [small_points.look(view, there[0]) for view, there in zip(small, picked(far_ids))]
     own = [o.with_hole(o.color, o.ids, there[0] > 0.5)[0] for o, there in zip(own, reduced(warped))]
+    scratch.rest_mapped()
     own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
     condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
                           reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip
@@ -359,16 +363,6 @@ def build_conditions(
 
 def _planes(render: RenderPlanes | None) -> tuple[Tensor, ...]:
     return tuple(getattr(render, f.name) for f in fields(RenderPlanes))
-
-
-def _stacked(rows: Iterable[Sequence[Tensor]], count: int) -> list[Tensor]:
-    """``torch.stack`` of every column of ``count`` rows, of which only one is in memory besides: they may be large images."""
-    stacks: list[Tensor] = []
-    for number, row in enumerate(rows):
-        stacks = stacks or [torch.empty((count, *x.shape), dtype=x.dtype) for x in row]
-        for stack, x in zip(stacks, row, strict=True):
-            stack[number] = x
-    return stacks
 
 
 def _in_order(renders: RenderPlanes | None) -> RenderAt | None:

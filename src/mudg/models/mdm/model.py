@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import palette, seeds
+from mudg.base import palette, scratch, seeds
 from mudg.base.crop import cropped
 from mudg.base.errors import UsageError
 from mudg.base.types import Clip, Condition
@@ -521,8 +521,8 @@ class MDM(nn.Module):
         )  # fmt: skip
 
     def _decoded(self, made: Made) -> Decoded:
-        """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made."""
-        return Decoded(((made.rgb + 1) / 2).clamp(0, 1), code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
+        """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its colour over."""
+        return Decoded(made.rgb.add_(1).div_(2).clamp_(0, 1), code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
 
     def _denoise(self, encoded: ConditionLatents, request: SampleRequest, number: int) -> tuple[dict[Modality, Tensor], Tensor]:
         """Draw sample `number` of a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
@@ -570,7 +570,9 @@ class _FinePixels:
 
     def crop(self, rows: slice, columns: slice) -> ConditionPixels:
         """A rectangle of pixels."""
-        return self.model._pixels_of(Stacked.of([cropped(self.fine, rows, columns)]))
+        found = cropped(self.fine, rows, columns)
+        scratch.rest_mapped()
+        return self.model._pixels_of(Stacked.of([found]))
 
 
 def _expected_error(log_error: Tensor) -> Tensor:

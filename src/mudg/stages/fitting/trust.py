@@ -60,7 +60,7 @@ def unseen_maps(
     heads = heads_of(recorded)
     chosen = np.unique(np.linspace(0, len(heads) - 1, min(WITNESSES, len(heads))).round().astype(int))
     witnesses = [_witness(model, heads[i].view, raster) for i in chosen]
-    objects = [node for node in model.nodes if isinstance(node, RigidNode)]
+    objects = [_Placed(node) for node in model.nodes if isinstance(node, RigidNode)]
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)
 
@@ -79,7 +79,22 @@ def block_centres(size_px: int) -> NDArray[np.intp]:
     return np.minimum(np.arange(0, size_px, STRIDE_PX) + STRIDE_PX // 2, size_px - 1)
 
 
-def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[RigidNode]) -> NDArray[np.bool_]:
+class _Placed:
+    """An object whose poses do not change meanwhile: each is worked out once, for every view asks for those of all witnesses."""
+
+    def __init__(self, node: RigidNode) -> None:
+        self.size_m = node.size_m
+        self._node = node
+        self._known: dict[float, NDArray[np.float64] | None] = {}
+
+    def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
+        """``RigidNode.pose_matrix``."""
+        if time_s not in self._known:
+            self._known[time_s] = self._node.pose_matrix(time_s)
+        return self._known[time_s]
+
+
+def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[_Placed]) -> NDArray[np.bool_]:
     height, width = stored.rgb.shape[:2]
     row, column = np.meshgrid(block_centres(height), block_centres(width), indexing="ij")
     shape = row.shape
@@ -113,7 +128,7 @@ def unseen_rows(
 
     A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes on.
     """
-    objects = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    objects = {index: _Placed(node) for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
     shares, stride, total = [], 1, 0
     for stored, unseen_here in unseen:
@@ -155,7 +170,7 @@ def _spread(points: StartPoints, most: int, rng: np.random.Generator) -> StartPo
 
 
 def _seeds_of(
-    stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, RigidNode], model: SceneModel
+    stored: StoredView, unseen: NDArray[np.bool_], objects: dict[int, _Placed], model: SceneModel
 ) -> list[tuple[int, StartPoints]]:
     """Points of one virtual view's unseen pixels, by node index."""
     if stored.depth is None:
@@ -198,7 +213,7 @@ def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArra
     return inside & (witness.depth[row, column] >= z * (1 - TOLERANCE))
 
 
-def _in_box(node: RigidNode, points: NDArray[np.float64], time_s: float) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def _in_box(node: _Placed, points: NDArray[np.float64], time_s: float) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
     """Indices of points in the node's box (grown by a tenth) and their coordinates in it; None if there are none."""
     pose = node.pose_matrix(time_s)
     if pose is None:
