@@ -39,15 +39,15 @@ GAP_M: Final = 0.25
 """A side has a gap where no Gaussian is within this distance."""
 AROUND_M: Final = 0.1
 SAME_HEIGHT_M: Final = 0.15
-INSET_M: Final = 0.03
-WIDTH_QUANTILE: Final = 0.97
+INSET_M: Final = 0.05
+WIDTH_QUANTILE: Final = 0.9
 LEAST_ROWS: Final = 8
 LIKE: Final = 32
 """A colour is the median of those of this many Gaussians, the nearest,"""
 ALIKE: Final = (0.3, 0.3, 3.0)
 """where a metre along, across and up counts so much."""
 OPACITY: Final = 0.95
-SHOWN_PX: Final = 0.15
+SHOWN_PX: Final = 0.01
 """What a recorded view shows more of than this is not hidden."""
 
 
