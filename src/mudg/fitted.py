@@ -122,10 +122,10 @@ class FittedScene:
             out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which it was seen.
         """
         from mudg.models.scene.edited import asset_of
-        from mudg.stages.editing.assets import sides_of, write_asset
+        from mudg.stages.editing.assets import complete_asset, write_asset
 
-        seen = () if scene is None else sides_of(self._model, track_id, scene).tolist()
-        write_asset(Path(out), asset_of(self._model, track_id, seen))
+        model, views = self._model, () if scene is None else tuple(frame.view for frame in scene.frames)
+        write_asset(Path(out), complete_asset(model, track_id, views) if views else asset_of(model, track_id))
         return Path(out)
 
     def render(self, camera: Camera, world_from_cam: ArrayLike, time_s: float, *, backend: str = "auto") -> Picture:

@@ -35,11 +35,10 @@ from mudg.data.edits import EditScript, parse_edits
 from mudg.data.scene import read_scene
 from mudg.models.featnets import CodecFeatures
 from mudg.models.mdm import files as mdm_files
-from mudg.models.scene.edited import asset_of
 from mudg.models.scene.model import SceneModel
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, HarmonizeConfig
-from mudg.stages.editing.assets import write_asset
+from mudg.stages.editing.assets import complete_asset, write_asset
 from mudg.stages.editing.carried import EditedDrive, carry_out
 from mudg.stages.editing.harmonised import repairing
 from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_scene
@@ -102,7 +101,7 @@ def _script(case: EditCase, text: str, out: Path) -> EditScript:
     """The script of an edit; an asset that it names is written first."""
     asset = out / "edited" / f"{case.city}.safetensors"
     if "ASSET" in text:
-        write_asset(asset, asset_of(case.model, case.name, ()))
+        write_asset(asset, complete_asset(case.model, case.name, [frame.view for frame in case.scene.frames]))
         moved = carry_out(parse_edits(MOVE.replace("ID", case.name), "move"), case.model, case.scene)
         motion = moved.plan.after.actors[case.name].motion
         yaws = np.degrees(np.unwrap(np.arctan2(motion.poses[:, 1, 0], motion.poses[:, 0, 0])))

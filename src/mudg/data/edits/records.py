@@ -91,6 +91,7 @@ class MoveEdit(StrictRecord):
     ramp_s: NotNegative = 1.0
     ground: bool = True
     close_street: bool | None = None
+    close_sides: bool = True
 
 
 class StopEdit(StrictRecord):
@@ -100,6 +101,7 @@ class StopEdit(StrictRecord):
     at_s: Number
     brake_m_s2: Annotated[float, Field(gt=0, le=12)] = 4.0
     close_street: bool | None = None
+    close_sides: bool = True
 
 
 class SpeedEdit(StrictRecord):
@@ -109,6 +111,7 @@ class SpeedEdit(StrictRecord):
     factor: Annotated[float, Field(gt=0, le=5)]
     from_s: Number | None = None
     close_street: bool | None = None
+    close_sides: bool = True
 
 
 class LaneChangeEdit(StrictRecord):
@@ -121,6 +124,7 @@ class LaneChangeEdit(StrictRecord):
     most_lateral_m_s2: Positive = 4.0
     ground: bool = True
     close_street: bool | None = None
+    close_sides: bool = True
 
 
 def _path_points(points: list[list[float]]) -> list[list[float]]:
@@ -146,6 +150,7 @@ class PathEdit(StrictRecord):
     points: Points
     ground: bool = True
     close_street: bool | None = None
+    close_sides: bool = True
 
     @model_validator(mode="after")
     def _drives(self) -> Self:

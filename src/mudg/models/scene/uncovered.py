@@ -156,7 +156,7 @@ def without_traces(
     if model.nodes[0].kind == "static" and gone and ground.sum() >= LEAST_GROUND:
         model, lost = _without_unseen(model, views, raster, absent)
         for one in gone:
-            model = _without(model, _left_over(one, model))
+            model = without_rows(model, _left_over(one, model))
         for one in gone:
             model = _shadow_gone(model, one)
         for one in gone:
@@ -200,7 +200,8 @@ def _solid(model: SceneModel) -> Rows:
     return torch.sigmoid(model.table["logits"].detach()).cpu().numpy() > SOLID_OPACITY
 
 
-def _without(model: SceneModel, gone: Rows) -> SceneModel:
+def without_rows(model: SceneModel, gone: Rows) -> SceneModel:
+    """A copy without some rows, bool[N]."""
     kept = torch.from_numpy(np.flatnonzero(~gone)).to(model.device)
     columns = {name: value.detach()[kept] for name, value in model.table.columns.items()}
     return replace(model, table=Table(columns, {key: value[kept] for key, value in model.table.labels.items()}), facts=dict(model.facts))
@@ -217,7 +218,7 @@ def _without_unseen(
         if not unseen.any():
             break
         lost.append(_means(model)[unseen & _ground(model)])
-        model = _without(model, unseen)
+        model = without_rows(model, unseen)
     return model, np.concatenate(lost)
 
 
@@ -310,11 +311,15 @@ def _closed(model: SceneModel, one: Hidden, lost: Array) -> SceneModel:
         "log_scales": np.tile(np.log([0.75 * CELL_M, 0.75 * CELL_M, 0.02]), (count, 1)),
         "logits": np.full(count, np.log(FILL_OPACITY / (1 - FILL_OPACITY))), "sh_dc": ((colors - 0.5) / SH_C0)[:, None],
     }  # fmt: skip
-    return _with_rows(model, seen[near], changed)
+    return with_copies(model, seen[near], changed)
 
 
-def _with_rows(model: SceneModel, likeness: NDArray[np.int64], changed: Mapping[str, Array]) -> SceneModel:
-    """With copies of some rows that differ from them in some columns; nobody saw what they show."""
+def with_copies(model: SceneModel, likeness: NDArray[np.int64], changed: Mapping[str, Array]) -> SceneModel:
+    """With copies of some rows, appended, that differ from them in some columns; nobody saw what they show.
+
+    Args:
+        likeness: rows i64[M]. changed: columns f64[M, ...] by name.
+    """
     rows = torch.from_numpy(likeness).to(model.device)
     columns = {name: value.detach()[rows].clone() for name, value in model.table.columns.items()}
     for name, values in changed.items():

@@ -23,6 +23,7 @@ from mudg.models.scene.edited import Asset
 from mudg.models.scene.initial import SH_C0
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
+from mudg.models.scene.sides import with_closed_sides
 from mudg.models.scene.sky import SkyNode
 from mudg.models.scene.uncovered import MOST_VIEWS, Hidden, noted, without_traces
 from mudg.stages.editing.plan import Actor, Background, EditPlan
@@ -32,6 +33,8 @@ EGO_FACT: Final = "edited_ego"
 """Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
 CUT_SHADOW: Final = 0.6
 """Strength of the contact shadow of what was cut out of the background."""
+SIDE_VIEWS: Final = 16
+"""Views that say which sides of objects the recording did not show, at most."""
 MOST_NAMED: Final = 4
 """More objects than these are counted in a message."""
 
@@ -41,9 +44,10 @@ StreetOf = Callable[[SceneModel, EditPlan], SceneModel]
 
 
 def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
-    """A fitted scene without the objects that a plan removes, with objects of their own for standing ones that it moves, and without
-    the traces of those behind which the street is closed (unless told not to `close` it). Depends on `left_behind` alone."""
-    without_nodes, removed, closed = left_behind(model, plan)
+    """A fitted scene without the objects that a plan removes, with objects of their own for standing ones that it moves, and, unless told
+    not to `close` anything, without the traces of those behind which the street is closed and with all sides of those that are moved.
+    Depends on `left_behind` alone."""
+    without_nodes, removed, closed, sides = left_behind(model, plan)
     model = _cut_out(model, without_nodes, plan)
     removed = tuple(name for name in removed if name in model.node_names())
     model = model.without_nodes([name for name in removed if not (close and name in closed)])
@@ -52,16 +56,21 @@ def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> Sce
         log.info(f"edit: the street behind {_some(closed)} is closed from {len(views)} recorded views (close_street)")
         model = noted(model, views, raster_of(model)).without_nodes([name for name in removed if name in closed])
         model = without_traces(model, hidden, views, raster_of(model))
+    sides = tuple(name for name in sides if close and name in model.node_names())
+    if sides:
+        model = with_closed_sides(model, sides, views_of([plan.before.actors[name] for name in sides], plan.views), raster_of(model))
     return model
 
 
-def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Ids of what a plan cuts out of the background, of what it removes, and of those behind which the street is closed."""
+def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], ...]:
+    """Ids of what a plan cuts out of the background, of what it removes, of those behind which the street is closed, and of those whose
+    sides are closed."""
     without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
+    sides = sorted(plan.sides & set(plan.before.actors)) if plan.views else []
     closed = sorted(plan.closed & set(plan.before.actors)) if plan.views else []
     if plan.background is not None:  # it is gone with the street
         without_nodes, closed = [], []
-    return tuple(without_nodes), tuple(plan.removed), tuple(closed)
+    return tuple(without_nodes), tuple(plan.removed), tuple(closed), tuple(sides)
 
 
 def _some(names: Sequence[str]) -> str:
@@ -93,10 +102,22 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None, str
     return model
 
 
-def spread(views: Sequence[View]) -> list[View]:
-    """At most `MOST_VIEWS` of some views, evenly."""
-    which = np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).round().astype(int))
+def spread(views: Sequence[View], most: int = MOST_VIEWS) -> list[View]:
+    """At most so many of some views, evenly."""
+    which = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
     return [views[int(index)] for index in which] if views else []
+
+
+def views_of(actors: Sequence[Actor], views: Sequence[View]) -> list[View]:
+    """Views in whose image the middle of one of some actors lies, at most `SIDE_VIEWS`."""
+    found = []
+    for view in views:
+        poses = [pose for actor in actors if (pose := actor.motion.pose_at(view.time_s)) is not None]
+        if poses:
+            uv, depth = geometry.project(view, np.stack(poses)[:, :3, 3])
+            inside = (depth > 0) & (uv >= 0).all(1) & (uv <= [view.camera.width, view.camera.height]).all(1)
+            found += [view] if inside.any() else []
+    return spread(found, SIDE_VIEWS)
 
 
 def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -19,13 +20,16 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.records import Number, StrictRecord, parse_record
 from mudg.base.run_folder import refuse_overlap
-from mudg.base.types import Scene
+from mudg.base.types import View
 from mudg.data.scene import read_scene
 from mudg.models.scene.edited import Asset, asset_of, motion_of
 from mudg.models.scene.model import SceneModel
+from mudg.models.scene.sides import with_closed_sides
+from mudg.stages.editing.apply import views_of
 from mudg.stages.editing.checks import sides_seen
 from mudg.stages.editing.plan import Actor
 from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.fitting.rendering import raster_of
 from mudg.stages.fitting.storage import load_model
 
 HEADER: Final = "mudg_asset"
@@ -66,17 +70,21 @@ def run_export(run: Path, name: str, out: Path, scene: Path | None = None, overw
 
 
 def asset_from(parts: RunParts, name: str, scene: Path | None = None) -> Asset:
-    """An object of a run, with the sides from which its scene shows it."""
+    """An object of a run, with the sides from which its scene shows it; those that it never shows are closed."""
     model = load_model(parts.model)
     place = scene or parts.scene
-    seen = np.zeros(0) if place is None else sides_of(model, name, read_scene(place))
-    return asset_of(model, name, seen.tolist())
+    if place is None:
+        return asset_of(model, name)
+    recorded = read_scene(place)
+    return complete_asset(model, name, [frame.view for frame in recorded.frames])
 
 
-def sides_of(model: SceneModel, name: str, scene: Scene) -> np.ndarray:
-    """From which sides the recorded images of a scene show an object, radians."""
+def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset:
+    """An object of a fitted scene, with the sides from which views show it; the others are closed (``models/scene/sides.py``)."""
     node = model.dynamic_object(name)
-    return sides_seen(Actor(node.label, (1, 1, 1), motion_of(node)), [frame.view for frame in scene.frames])
+    actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), motion_of(node))
+    closed = with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
+    return asset_of(closed, name, sides_seen(actor, views).tolist())
 
 
 def write_asset(path: Path, asset: Asset) -> None:

@@ -30,7 +30,7 @@ from mudg.stages.editing.apply import (
     street_left,
 )
 from mudg.stages.editing.assets import asset_from, read_asset
-from mudg.stages.editing.checks import check
+from mudg.stages.editing.checks import check, shown_anew
 from mudg.stages.editing.plan import Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.editing.weathered import conditions_of
@@ -97,6 +97,7 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
                                    "of it is not known (give --scene)"})  # fmt: skip
     made = None if scene is None else edited_scene(scene, plan)
     views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
+    plan.sides &= shown_anew(plan, *views)
     notes = check(plan, *views)
     for note in notes:
         (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")

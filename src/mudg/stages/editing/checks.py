@@ -24,6 +24,8 @@ EGO_CENTRE_AHEAD_M: Final = 0.7
 FARTHEST_M: Final = 80.0
 SELDOM_RAD: Final = np.radians(30.0)
 LEAST_SHARE: Final = 0.05
+ANOTHER_SIDE_RAD: Final = np.radians(3.0)
+"""From a direction that differs by more than this, a view shows flanks that the recording may not have shown."""
 
 
 def check(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
@@ -108,6 +110,20 @@ def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequ
             "text": f"{name}: {share:.0%} of its views look at sides that the recording saw from more than 30 degrees away "
                     f"(up to {largest:.0f})" if len(seen) else f"{name}: the recording never shows it",
         })  # fmt: skip
+    return found
+
+
+def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> set[str]:
+    """Objects of the recording of whose changed paths some view shows a side that no recorded view shows, from more than
+    `ANOTHER_SIDE_RAD` away."""
+    found = set()
+    for name in plan.changes:
+        if name not in plan.before.actors or name not in plan.after.actors:
+            continue
+        asked = sides_seen(plan.after.actors[name], views_after)
+        seen = sides_seen(plan.before.actors[name], views_before)
+        if len(asked) and len(seen) and boxes.angle_to_nearest(asked, seen).max() > ANOTHER_SIDE_RAD:
+            found.add(name)
     return found
 
 

@@ -125,6 +125,7 @@ class EditPlan:
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
         closed: actors without whose traces the street is to be shown, if they were recorded (``models/scene/uncovered.py``).
+        sides: actors whose sides that no view showed are to be closed (``models/scene/sides.py``).
     """
 
     before: EditWorld
@@ -139,6 +140,7 @@ class EditPlan:
     moves_ego: bool = False
     views: tuple[View, ...] = ()
     closed: set[str] = field(default_factory=set)
+    sides: set[str] = field(default_factory=set)
 
     def changed(self, name: str, motion: Motion) -> Motion:
         """The path of an actor of the recording with all that is done to it."""
@@ -167,9 +169,11 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
             _VERBS[edit.verb](plan, edit.settings, sources)
             if edit.verb in _DISPLACING:
                 _close(plan, edit.settings.id, edit.settings, sources)
+                (plan.sides.add if edit.settings.close_sides else plan.sides.discard)(edit.settings.id)
         except (InputError, UsageError) as problem:
             raise _located(problem, edit) from problem
     plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
+    plan.sides &= set(plan.changes)
     return plan
 
 

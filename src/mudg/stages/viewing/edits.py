@@ -143,9 +143,9 @@ class EditDesk:
         return store.json_text(said, indent=None).encode(), "application/json"
 
     def _checked(self, text: str) -> EditedDrive:
-        """A script that can be carried out on the fits, too. Streets are closed later, when a frame is asked for."""
+        """A script that can be carried out on the fits, too. Streets and sides are closed later, when a frame is asked for."""
         drive = self._carried(text)
-        if not drive.plan.closed:
+        if not (drive.plan.closed or drive.plan.sides):
             self.edited(text)
             return drive
         for model in self.models:
