@@ -22,6 +22,7 @@ from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, V
 from mudg.core.fusion import (
     STATIC,
     CloudAccumulator,
+    FusionReport,
     FusionRules,
     SweepShots,
     fuse_sweeps,
@@ -564,3 +565,13 @@ def test_real_sequence_reproduces_its_protocol_and_the_occlusion_test_helps(
 def test_real_sequence_moves_what_its_readme_says(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     scene = IMPORTERS["kitti"](shared_data("kitti_2011_09_26"), tmp_path / "scene", ImportOptions())
     assert {t.id for t in scene.tracks if judge_track(t, RULES).moving} == {"0", "1", "2"}
+
+
+def test_many_objects_that_are_left_out_are_counted() -> None:
+    report = FusionReport()
+    report.left_out = {f"car-{n}": f"{n} coloured points, fewer than 100" for n in range(5)}
+    lines = fuse.describe(report)[2:]
+    assert lines[0] == "dynamic object car-0 left out: 0 coloured points, fewer than 100"
+    assert len(lines) == 4 and lines[3] == "2 more dynamic objects left out: fuse.json says why"
+    report.left_out = {"car-1": "no points"}
+    assert fuse.describe(report)[2:] == ["dynamic object car-1 left out: no points"]

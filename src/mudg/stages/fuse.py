@@ -39,6 +39,8 @@ from mudg.stages.config import FuseConfig
 
 _OUTPUT = VerbOutput("fuse", 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
 _TOP_VIEW_PX = (1400, 1000)
+MOST_NAMED = 3
+"""Objects that are left out are named up to here, then counted."""
 MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
 """To match the cameras' colours: sweeps, images of each camera per sweep, and how far in time they may be."""
 
@@ -176,7 +178,10 @@ def describe(report: FusionReport) -> list[str]:
         f"{report.points_hidden / total:.1%} occluded, {report.points_unseen / total:.0%} in no image",
         f"{len(dynamic)} of {len(report.verdicts)} tracked boxes are dynamic; {report.points_static} points in the static cloud",
     ]
-    lines += [f"dynamic object {track_id} left out: {words}" for track_id, words in report.left_out.items()]
+    shown = list(report.left_out.items())[:MOST_NAMED]
+    lines += [f"dynamic object {track_id} left out: {words}" for track_id, words in shown]
+    if len(report.left_out) > len(shown):
+        lines.append(f"{len(report.left_out) - len(shown)} more dynamic objects left out: fuse.json says why")
     return lines
 
 
