@@ -287,7 +287,7 @@ def _as_completed(
     waiting, dead_for = set(futures), 0
     while waiting:
         done, waiting = concurrent.futures.wait(waiting, _POLL_S, concurrent.futures.FIRST_COMPLETED)
-        for future in done:
+        for future in sorted(done, key=lambda one: one.exception() is None):  # errors first: after one, nothing is handed out
             if isinstance(future.exception(), KeyboardInterrupt):
                 raise BrokenProcessPool("a worker was stopped")
             result = future.result()

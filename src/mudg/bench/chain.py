@@ -147,6 +147,8 @@ class FitChain:
                 of the same settings: the first one, if these are the usual ones but for virtual views.
         """
         out = self.out / "fit" / name
+        if name == LONGER:
+            return self.longer(name)
         if settings.method == REPAIRED:
             return self._repaired(name, settings)
         if not learns_virtual(settings):

@@ -289,19 +289,13 @@ def views_of(job: PaperJob, row: PaperRow, scene: Path, asked: Asked) -> tuple[P
             on_path = replace(asked.off_path, shifts_m=(0.0,), paths=(), **row.changes)
             found.append(_generated(job, on_path, scene, first, job.out / "generated" / f"{row.name}-{RECORDED}"))
         return tuple(found)
-    model, views = _fitted(job, row, scene, asked, fits), job.out / "render" / row.name
-    return (made(lambda o: render.run(asked.drawn, scene, model, views, overwrite=o), job.overwrite),)
-
-
-def _fitted(job: PaperJob, row: PaperRow, scene: Path, asked: Asked, fits: FitChain) -> Path:
-    if row.name == LONGER:
-        return fits.longer(row.name)
     settings = configuration.load(FitConfig, job.usual, overrides={"method": row.method, **row.changes})
     virtual: tuple[Path, ...] = ()
     if learns_virtual(settings):
         first = fits.first() if job.renders else None
         virtual = (_generated(job, asked.off_path, scene, first, job.out / "virtual"),)
-    return fits.fitted(row.name, settings, virtual)
+    model, views = fits.fitted(row.name, settings, virtual), job.out / "render" / row.name
+    return (made(lambda o: render.run(asked.drawn, scene, model, views, overwrite=o), job.overwrite),)
 
 
 def _generated(job: PaperJob, settings: SynthesizeConfig, scene: Path, fitted: Path | None, out: Path) -> Path:

@@ -275,8 +275,7 @@ def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajec
         raise UsageError("a method without views", got=row.name)
     if row.name == EXACT:
         painted = made(lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o), job.overwrite)
-    model = job.fits.longer(row.name) if row.name == LONGER else job.fits.fitted(row.name, settings, (painted,))
-    views = job.out / "render" / row.name
+    model, views = job.fits.fitted(row.name, settings, (painted,)), job.out / "render" / row.name
     return made(lambda o: render.run(drawn, scene, model, views, overwrite=o), job.overwrite)
 
 
