@@ -108,6 +108,18 @@ def full():
     return memory_plan.meta_model(config, torch.bfloat16), memory_plan.needs_of(config, 2)
 
 
+def test_inputs_that_die_hide_nothing():
+    """A tensor that gets the address of an input that is gone is counted all the same."""
+    inputs = [torch.empty(1, device="meta") for _ in range(64)]
+
+    def work():
+        while inputs:
+            inputs.pop().add(1)
+        return [torch.empty(1024, device="meta") for _ in range(256)]
+
+    assert memory_plan.peak_activations(work) == 256 * 4096
+
+
 @pytest.mark.parametrize(
     ("card_gb", "together", "frames"), [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)]
 )

@@ -46,21 +46,22 @@ class _Live(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         for tensor in _pytree.tree_leaves((args, kwargs)):
             if isinstance(tensor, Tensor) and tensor.is_meta:
-                self._known.add(tensor.untyped_storage()._cdata)  # weights and inputs: there before
+                self._add(tensor.untyped_storage(), born=False)  # weights and inputs: there before
         result = func(*args, **(kwargs or {}))
         for tensor in _pytree.tree_leaves(result):
             if isinstance(tensor, Tensor) and tensor.is_meta:
-                self._add(tensor.untyped_storage())
+                self._add(tensor.untyped_storage(), born=True)
         self.peak = max(self.peak, self.now)
         return result
 
-    def _add(self, storage: torch.UntypedStorage) -> None:
+    def _add(self, storage: torch.UntypedStorage, *, born: bool) -> None:
         key = storage._cdata
         if key in self._known:
             return
         self._known.add(key)
-        size = storage.nbytes()
+        size = storage.nbytes() if born else 0
         self.now += size
+        # An input may die too, and its address then belongs to another storage.
         weakref.finalize(storage, self._remove, key, size)
 
     def _remove(self, key: int, size: int) -> None:
