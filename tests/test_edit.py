@@ -17,7 +17,7 @@ from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.base.types import Camera, Track, View
+from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
 from mudg.bench.edit import city_keys
 from mudg.core import boxes
 from mudg.core import edit as paths
@@ -26,6 +26,7 @@ from mudg.core.ground import HeightMap
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.data.city import CityConfig, CityWorld
+from mudg.data.city import records as rec
 from mudg.data.edits import parse_edits, read_edits
 from mudg.models.scene import edited
 from mudg.models.scene.bezier import BezierNode
@@ -36,7 +37,7 @@ from mudg.models.scene.nodes import DeformableNode, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
 from mudg.stages.config import DEMO_CITY
 from mudg.stages.editing import assets
-from mudg.stages.editing.apply import edited_model
+from mudg.stages.editing.apply import edited_cloud, edited_model, lit
 from mudg.stages.editing.carried import carry_out
 from mudg.stages.editing.checks import collisions
 from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
@@ -374,13 +375,71 @@ def test_an_asset_takes_the_light_of_the_scene() -> None:
     with torch.no_grad():
         rows = dark.table.labels["node"] == 0
         dark.table["sh_dc"][rows] = (0.25 - 0.5) / SH_C0
-    lit, gain = edited.matched_light(edited.asset_of(bright, "car-1"), dark)
+    lit, gain = edited.matched_light(edited.asset_of(bright, "car-1"), edited.surface_light(dark))
     linear = lambda v: ((v + 0.055) / 1.055) ** 2.4  # noqa: E731
-    assert gain == pytest.approx([linear(0.25) / linear(0.4)] * 3, rel=1e-4)
-    same, one = edited.matched_light(edited.asset_of(bright, "car-1"), bright)
+    assert gain == pytest.approx(linear(0.25) / edited.surface_light(bright), rel=1e-4)
+    same, one = edited.matched_light(edited.asset_of(bright, "car-1"), edited.surface_light(bright))
     assert one == pytest.approx([1, 1, 1])
     before, after = (0.5 + SH_C0 * a.columns["sh_dc"] for a in (edited.asset_of(bright, "car-1"), same))
     assert torch.allclose(before.clamp(min=0), after.clamp(min=0), atol=1e-3)
+
+
+def test_the_light_of_surfaces_counts_opacity_and_area_of_the_background() -> None:
+    model = toy()
+    still = model.table.labels["node"] == 0
+    with torch.no_grad():
+        model.table["sh_dc"][still] = (0.4 - 0.5) / SH_C0
+        model.table["sh_dc"][:300] = (0.8 - 0.5) / SH_C0
+        model.table["log_scales"][still] = torch.log(torch.tensor([0.3, 0.2, 0.01]))
+        model.table["logits"][still] = 0.0
+        model.table["log_scales"][:300, 1] += np.log(2.0)
+        model.table["logits"][:300] = -np.log(3.0)  # opacity 1/4
+        model.table["sh_dc"][~still] = 7.0
+    bright, dark = edited.linear_of(np.array([0.8, 0.4]))
+    area = [2 / 4 * 300, 1 / 2 * 340]
+    assert edited.surface_light(model) == pytest.approx([(bright * area[0] + dark * area[1]) / sum(area)] * 3, rel=1e-5)
+    assert edited.surface_light(model.without_nodes([])) is not None
+    few = replace(model, table=Table(*({k: v[600:] for k, v in part.items()} for part in (model.table.columns, model.table.labels))))
+    assert edited.surface_light(few) is None
+    assert edited.light_gain(None, np.ones(3)) == pytest.approx([1, 1, 1])
+    assert edited.light_gain(np.full(3, 0.01), np.full(3, 0.9)) == pytest.approx([4, 4, 4])
+
+
+def test_objects_take_the_light_of_another_street() -> None:
+    """Gaussians and fused points alike, those that are put in and those that are kept; what asks to stay stays."""
+    model, dim = toy(), toy()
+    with torch.no_grad():
+        dim.table["sh_dc"][dim.table.labels["node"] == 0] = (0.2 - 0.5) / SH_C0
+    gain = edited.light_gain(edited.surface_light(model), edited.surface_light(dim))
+    assert gain.max() < 0.5
+    asset = edited.asset_of(model, "car-1")
+    ego = Motion.recorded([0.0, 2.0], np.stack([geometry.yaw_matrix(0.0)] * 2))
+    x, y = np.meshgrid(np.arange(-6, 40, 0.5), np.arange(-8, 8, 0.5), indexing="ij")
+    ground = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
+    points = PointCloud(np.zeros((1, 3), np.float32), np.full((1, 3), 200, np.uint8), "object", None)
+    street = PointCloud(np.zeros((1, 3), np.float32), np.full((1, 3), 90, np.uint8), "world", None)
+    cloud = FusedCloud(street, {"car-1": points})
+    world = EditWorld(EditWorld.of_model(model, None).actors, ego, HeightMap.from_points(ground))
+    place = "id: new, asset: {file: x.safetensors}, path: [[0, 20, 3, 0]], shadow: 0"
+
+    def made(background: str, insert: str) -> tuple[SceneModel, FusedCloud]:
+        text = f"- insert: {{{place}{insert}}}\n- background: {{run: other{background}}}"
+        plan = planned(text, world, lambda source: asset, lambda name: Background(dim, ego, ground, street))
+        lit(plan, model)
+        return edited_model(model, plan), edited_cloud(cloud, plan)
+
+    def shown(scene: SceneModel, name: str) -> float:
+        rows = scene.table.labels["node"] == scene.nodes.index(scene.dynamic_object(name))
+        return float(edited.linear_of((0.5 + SH_C0 * scene.table["sh_dc"].detach()[rows].double().numpy()).clip(0)).mean())
+
+    plain, cloud_plain = made(", match_light: false", ", match_light: false")
+    full, cloud_full = made("", "")
+    for name in ("car-1", "new"):
+        assert shown(full, name) / shown(plain, name) == pytest.approx(gain[0], rel=0.02)
+        before, after = (edited.linear_of(c.objects[name].rgb / 255).mean() for c in (cloud_plain, cloud_full))
+        assert after / before == pytest.approx(gain[0], rel=0.05)
+    assert cloud_plain.objects["car-1"].rgb.max() == 200 and cloud_full.static.rgb.max() == 90
+    assert shown(plain, "car-1") == pytest.approx(shown(model, "car-1"))
 
 
 def test_a_contact_shadow_darkens_the_ground_by_its_strength() -> None:
@@ -515,6 +574,24 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
     with pytest.raises(UsageError, match="no such object"):
         city.rearranged({"car-999": None})
+
+
+def test_the_city_is_drawn_again_with_another_look() -> None:
+    city, other = (CityWorld(CityConfig(seed=seed, n_frames=4, width=64, height=40)) for seed in (DEMO_CITY, DEMO_CITY + 1))
+    frame = city.frame_views("front")[1]
+    truth = city.render(frame)
+    number = int(np.bincount(truth.instance.ravel())[1:].argmax()) + 1
+    name = city.tracks()[number - 1].id
+    assert np.array_equal(city.recast(name, city.objects[number - 1]).render(frame).rgb, truth.rgb)
+    look = next(posed for posed in other.objects if posed.row[0] == rec.VAN)
+    drawn = city.recast(name, look)
+    assert np.allclose(drawn.tracks()[number - 1].size_m, look.size)
+    assert np.allclose(drawn.tracks()[number - 1].world_from_object[:, :2, 3], city.tracks()[number - 1].world_from_object[:, :2, 3])
+    seen = drawn.render(frame)
+    assert (seen.instance == number).any() and (seen.rgb != truth.rgb).any()
+    assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
+    gone = {name: None}
+    assert np.array_equal(drawn.rearranged(gone).render(frame).rgb, city.rearranged(gone).render(frame).rgb)
 
 
 def test_another_street_lies_where_the_vehicle_drives() -> None:

@@ -31,10 +31,12 @@ from mudg.core import metrics
 from mudg.core.edit import Motion
 from mudg.core.edit_scores import SAME
 from mudg.core.fusion import fuse_sweeps
+from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.core.raster.rasterize import rasterize
 from mudg.data.city import CityWorld
 from mudg.data.edits import parse_edits
 from mudg.data.scene import read_label
+from mudg.models.featnets import CodecFeatures
 from mudg.models.scene.model import SceneModel, compose
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FuseConfig
@@ -122,7 +124,7 @@ def row_of(case: EditCase, name: str, text: str) -> dict[str, Any]:
     counts = np.zeros((2, 2), np.int64)  # with and without the edit: pixels in both, pixels in either
     for frame in case.scene.frames[::EVERY_FRAMES]:
         now, then = truth.render(frame.view), case.world.render(frame.view)
-        made, usual = (_rendered(model, frame.view) for model in (edited, case.model))
+        made, usual = (rendered(model, frame.view) for model in (edited, case.model))
         mask = np.abs(now.rgb - then.rgb).max(-1) > CHANGED
         new, old = made - now.rgb, usual - then.rgb
         mine = now.instance == instance
@@ -137,7 +139,7 @@ def row_of(case: EditCase, name: str, text: str) -> dict[str, Any]:
     overlaps = [float(a / b) if b else None for a, b in counts]
     return {
         "city": case.city, "object": case.name, "edit": name, "pixels": int(sum(len(e) for e in errors["inside"])),
-        **{place: _psnr(found) for place, found in errors.items()}, "outside": float(np.concatenate(outside).mean()),
+        **{place: psnr_in(found) for place, found in errors.items()}, "outside": float(np.concatenate(outside).mean()),
         "overlap": None if actor is None else overlaps[0], "overlap_before": overlaps[1],
     }  # fmt: skip
 
@@ -148,7 +150,8 @@ def city_keys(motion: Motion, height_m: float) -> NDArray[np.float64]:
     return np.column_stack([motion.poses[:, :2, 3], motion.poses[:, 2, 3] - height_m / 2, yaws])
 
 
-def _rendered(model: SceneModel, view: View) -> NDArray[np.float32]:
+def rendered(model: SceneModel, view: View) -> NDArray[np.float32]:
+    """The image f32[H, W, 3] of a scene."""
     return render_view(model, view, raster_of(model)).rgb.permute(1, 2, 0).numpy()
 
 
@@ -163,9 +166,18 @@ def drawn_pixels(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
     return np.zeros(0, bool) if render.extra is None else (render.extra[0] > 0.5).cpu().numpy()
 
 
-def _psnr(errors: list[NDArray[np.float32]]) -> float | None:
-    every = torch.from_numpy(np.concatenate(errors))
+def psnr_in(errors: list[NDArray[np.float32]]) -> float | None:
+    """PSNR of some pixels' errors, each f32[n, 3]; None where there is no pixel."""
+    every = torch.from_numpy(np.concatenate(errors)) if errors else torch.zeros(0)
     return metrics.psnr_of_errors(every) if len(every) else None
+
+
+def distance_in(codec: CodecFeatures, made: NDArray[np.float32], true: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:
+    """Perceptual distance of two images f32[H, W, 3], weighted by the pixels of a mask."""
+    pair = [torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))) for image in (made, true)]
+    with torch.no_grad():
+        weight = torch.from_numpy(mask).float()[None]
+        return float(lpips_distance(codec(pair[0]), unit_features(codec(pair[1])), weight, over_weight=True))
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

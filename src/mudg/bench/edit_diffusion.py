@@ -10,7 +10,7 @@ Numbers are those of `bench/edit.py`, and the perceptual distance in the pixels 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -23,12 +23,11 @@ from scipy import ndimage
 from mudg.base import log, store
 from mudg.base.types import Observation, View
 from mudg.bench import edit as bench_edit
+from mudg.bench import edit_insert
 from mudg.bench import poses as bench_poses
-from mudg.bench.edit import CHANGED, NEARBY_PX, EditCase, city_keys
-from mudg.core import metrics
+from mudg.bench.edit import CHANGED, NEARBY_PX, EditCase, city_keys, distance_in, psnr_in
 from mudg.core.edit_scores import SAME
 from mudg.core.fusion import fuse_sweeps
-from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.data.city import CityWorld
 from mudg.data.city.recording import write_world
 from mudg.data.edits import EditScript, parse_edits
@@ -148,23 +147,11 @@ def scores(case: EditCase, truth: CityWorld, draws: tuple[Draw, Draw]) -> dict[s
         far = np.logical_not(ndimage.binary_dilation(mask, iterations=NEARBY_PX))
         outside.append((np.abs(made - usual).max(-1) > SAME)[far])
         if mask.any():
-            distances.append(_distance(codec, (made, now.rgb), mask))
+            distances.append(distance_in(codec, made, now.rgb, mask))
     return {
-        **{place: _psnr(found) for place, found in errors.items()},
+        **{place: psnr_in(found) for place, found in errors.items()},
         "outside": float(np.concatenate(outside).mean()), "perceptual": float(np.mean(distances)) if distances else None,
     }  # fmt: skip
-
-
-def _psnr(errors: list[NDArray[np.float32]]) -> float | None:
-    every = torch.from_numpy(np.concatenate(errors))
-    return metrics.psnr_of_errors(every) if len(every) else None
-
-
-def _distance(codec: CodecFeatures, pair: Sequence[NDArray[np.float32]], mask: NDArray[np.bool_]) -> float:
-    made, true = (torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))) for image in pair)
-    with torch.no_grad():
-        weight = torch.from_numpy(mask).float()[None]
-        return float(lpips_distance(codec(made), unit_features(codec(true)), weight, over_weight=True))
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -195,11 +182,14 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def with_diffusion(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    """`mudg bench edit`: the edits of fitted scenes, and, if asked for, what a diffusion model adds."""
+    """`mudg bench edit`: the edits of fitted scenes, vehicles of other cities, and, if asked for, what a diffusion model adds."""
     result, text = bench_edit.measure(config, out)
+    if len(result["cities"]) > 1:
+        rows = edit_insert.measure(config, result["cities"], out)
+        result, text = {**result, "insert": {"rows": rows, "summary": edit_insert.summary(rows)}}, text + edit_insert.table(rows)
     if not config.harmonize:
         return result, text
-    rows: list[dict[str, Any]] = []
+    rows = []
     with log.task("editing with diffusion", len(result["cities"])) as bar:
         for city in result["cities"]:
             rows += _rows_of_city(config, city, out)

@@ -101,26 +101,33 @@ class CityWorld:
     def __init__(self, config: CityConfig) -> None:
         self.config = config
         self.plan: StreetPlan = plan_streets(config)
-        self.light_name, light = light_numbers(config)
+        self.light_name: str = light_numbers(config)[0]
         self._ego_times, self._ego_poses = ego_keys(config, self.plan)
         self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
         self._key_times = key_times(config)
-        rows = furnish(config, self.plan) + [m.row for m in self.objects]
-        self.lamps: NDArray[np.float64] = lamp_places(rows)
+        furniture = furnish(config, self.plan)
+        self.lamps: NDArray[np.float64] = lamp_places(furniture + [m.row for m in self.objects])
         no_keys = np.zeros((len(self._key_times), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
-        records = np.array(rows, np.float64).reshape(-1, rec.COLUMNS)
-        self._handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), light, _seed31(config, "city surfaces"))
-        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
-            self._handle.set_texture(slot, rgb, metres)
-        numbers = weather_numbers(config)
-        if numbers is not None:
-            self._handle.set_weather(numbers, self.lamps)
+        self._handle = self._handle_with(furniture)
         self._cameras = rig.cameras(config)
         self._mounts = rig.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)
+
+    def _handle_with(self, furniture: list[list[float]]) -> CityHandle:
+        """The native world of all shapes, in its light and weather."""
+        config = self.config
+        records = np.array(furniture + [m.row for m in self.objects], np.float64).reshape(-1, rec.COLUMNS)
+        road, light, seed = _road_numbers(config, self.plan), light_numbers(config)[1], _seed31(config, "city surfaces")
+        handle = CityHandle(records, self.plan, road, light, seed)
+        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
+            handle.set_texture(slot, rgb, metres)
+        numbers = weather_numbers(config)
+        if numbers is not None:
+            handle.set_weather(numbers, self.lamps)
+        return handle
 
     @classmethod
     def from_source(cls, source: Source) -> CityWorld:
@@ -156,6 +163,22 @@ class CityWorld:
                 moved[:, known[track_id]] = values
         other = copy.copy(self)
         other._keys = moved
+        return other
+
+    def recast(self, track_id: str, look: PosedObject) -> CityWorld:
+        """The same world, light and shadows included, with another object on the path of a vehicle or person.
+
+        Args:
+            look: whose shape, size and paint it gets, for example an object of another world.
+        """
+        index = self.instance_of(track_id) - 1
+        mine = self.objects[index]
+        objects = list(self.objects)
+        objects[index] = PosedObject([*look.row[:-1], mine.row[-1]], mine.keys, look.gait_rad_per_s, mine.moving)
+        other = copy.copy(self)
+        other.objects = tuple(objects)
+        other._gaits = np.array([m.gait_rad_per_s for m in objects], np.float64)
+        other._handle = other._handle_with(furnish(self.config, self.plan))
         return other
 
     @property

@@ -225,6 +225,7 @@ class BackgroundEdit(StrictRecord):
     keep: Annotated[list[Literal["objects", "ego"]], Field(min_length=1), after(_with_ego)] = Field(
         default_factory=lambda: ["objects", "ego"]
     )
+    match_light: bool = True
 
 
 class SkyEdit(StrictRecord):

@@ -123,13 +123,19 @@ def lowest_points(model: SceneModel) -> NDArray[np.float32]:
     return means[order[rank < np.repeat(np.ceil(counts / 5), counts)]]
 
 
-def road_color(model: SceneModel) -> NDArray[np.float64] | None:
-    """Median colour f64[3] of the road's Gaussians, display values; None where there are fewer than 50."""
-    still = (model.table.labels["node"] == 0).cpu().numpy()
-    rows = still & (classes_of_rows(model) == ID["road"])
+def surface_light(model: SceneModel) -> NDArray[np.float64] | None:
+    """Mean light f64[3] that the surfaces of a scene give off, linear; None where the background has fewer than 50 Gaussians.
+
+    Background Gaussians count by opacity and area (the product of their two longest axes, at most its 99th percentile), objects do not.
+    """
+    rows = (model.table.labels["node"] == 0).cpu().numpy()
     if rows.sum() < 50:
         return None
-    return np.median(0.5 + SH_C0 * model.table["sh_dc"].detach().cpu().numpy()[rows, 0].astype(np.float64), 0)
+    values = (model.table[name].detach().cpu().numpy()[rows].astype(np.float64) for name in ("sh_dc", "log_scales", "logits"))
+    color, log_scales, logits = values
+    area = np.exp(np.sort(log_scales, 1)[:, 1:].sum(1))
+    weight = np.minimum(area, np.percentile(area, 99)) / (1 + np.exp(-logits.reshape(-1)))
+    return np.average(linear_of((0.5 + SH_C0 * color[:, 0]).clip(0, 1)), 0, weight)
 
 
 def cut_out(model: SceneModel, track: Track) -> SceneModel:
@@ -231,7 +237,7 @@ class Asset:
         class_ids: train id of every Gaussian, i64[n]; -1 = unknown.
         certainty: f32[n] in [0, 1] or None.
         label, size_m: of its box.
-        road_rgb: median colour of the road of its scene, display values, or None.
+        light_rgb: mean light of the surfaces of its scene (``surface_light``), or None.
         seen_rad: from which sides it was recorded: angles from its front, counter-clockwise.
         origin: where it comes from, for people.
     """
@@ -241,7 +247,7 @@ class Asset:
     certainty: NDArray[np.float32] | None
     label: str
     size_m: tuple[float, float, float]
-    road_rgb: tuple[float, float, float] | None
+    light_rgb: tuple[float, float, float] | None
     seen_rad: tuple[float, ...]
     origin: str
 
@@ -261,11 +267,11 @@ def asset_of(model: SceneModel, name: str, seen_rad: Sequence[float] = (), origi
     columns = {key: model.table[key].detach()[rows].cpu() for key in ("means", "quats", "log_scales", "logits", "sh_dc")}
     if type(node) is not RigidNode:
         columns |= _shape_at_middle(model, node, rows)
-    road, known = road_color(model), model.certainty
+    light, known = surface_light(model), model.certainty
     size = (node.size_m[0], node.size_m[1], node.size_m[2])
     return Asset(
         columns, classes_of_rows(model)[rows.cpu().numpy()], None if known is None else known[rows].float().cpu().numpy(),
-        node.label, size, None if road is None else (float(road[0]), float(road[1]), float(road[2])),
+        node.label, size, None if light is None else (float(light[0]), float(light[1]), float(light[2])),
         tuple(float(a) for a in seen_rad), origin or f"{model.facts.get('scene', 'a scene')}: {name}",
     )  # fmt: skip
 
@@ -286,19 +292,28 @@ def _shape_at_middle(model: SceneModel, node: RigidNode, rows: Tensor) -> dict[s
     return {"means": torch.from_numpy(means), "quats": now.quats.cpu() @ left_product_matrix(turn).T}
 
 
-def matched_light(asset: Asset, model: SceneModel) -> tuple[Asset, NDArray[np.float64]]:
-    """The asset in the light of a scene, and the gain of each channel, f64[3], in linear light.
+def matched_light(asset: Asset, there: NDArray[np.float64] | None) -> tuple[Asset, NDArray[np.float64]]:
+    """The asset in the light of a scene (its ``surface_light``), and the gain of each channel, f64[3], in linear light (``light_gain``)."""
+    gain = light_gain(None if asset.light_rgb is None else np.asarray(asset.light_rgb), there)
+    return replace(asset, columns={**asset.columns, "sh_dc": relit(asset.columns["sh_dc"], gain)}), gain
 
-    Both scenes' roads are taken to be of one material, so that the ratio of their colours is that of their mean irradiance. Gains are
-    kept within 1/4 to 4; where a scene has no road, 1.
+
+def light_gain(here: NDArray[np.float64] | None, there: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Factor f64[3] from the light of one scene to that of another, in linear light.
+
+    The surfaces of two streets are taken to reflect alike on the whole, so that the ratio of their mean light is that of illumination and
+    exposure (the assumption of a grey world). Kept within 1/4 to 4; 1 where either is not known.
+
+    Args:
+        here, there: mean light of surfaces f64[3] (``surface_light``).
     """
-    here = road_color(model)
-    if here is None or asset.road_rgb is None:
-        return asset, np.ones(3)
-    gain = (linear_of(here) / np.maximum(linear_of(np.asarray(asset.road_rgb)), 1e-4)).clip(0.25, 4.0)
-    shown = 0.5 + SH_C0 * asset.columns["sh_dc"].double().numpy()
-    lit = torch.from_numpy((display_of(linear_of(shown) * gain) - 0.5) / SH_C0).float()
-    return replace(asset, columns={**asset.columns, "sh_dc": lit}), gain
+    return np.ones(3) if here is None or there is None else (there / np.maximum(here, 1e-4)).clip(0.25, 4.0)
+
+
+def relit(sh_dc: Tensor, gain: NDArray[np.float64]) -> Tensor:
+    """Colours of degree 0 f32[n, 1, 3] with their linear light multiplied by a gain f64[3]."""
+    shown = 0.5 + SH_C0 * sh_dc.detach().cpu().double().numpy()
+    return torch.from_numpy((display_of(linear_of(shown) * gain) - 0.5) / SH_C0).to(sh_dc)
 
 
 def linear_of(display: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -310,6 +325,18 @@ def linear_of(display: NDArray[np.float64]) -> NDArray[np.float64]:
 def display_of(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse of ``linear_of``."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def with_relit_objects(model: SceneModel, gain: NDArray[np.float64]) -> SceneModel:
+    """A copy whose objects give off their linear light times a gain f64[3]; what their colours add with direction grows with them."""
+    table, mine = model.table, model.table.labels["node"] > 0
+    old = table["sh_dc"].detach()
+    new = torch.where(mine[:, None, None], relit(old, gain), old)
+    columns = {**{name: value.detach() for name, value in table.columns.items()}, "sh_dc": new}
+    if "sh_rest" in columns:
+        shown = [(0.5 + SH_C0 * value).clamp(min=1 / 255) for value in (old, new)]
+        columns["sh_rest"] = torch.where(mine[:, None, None], columns["sh_rest"] * (shown[1] / shown[0]), columns["sh_rest"])
+    return replace(model, table=Table(columns, dict(table.labels)), facts=dict(model.facts))
 
 
 def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label: str = "") -> SceneModel:

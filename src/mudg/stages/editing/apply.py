@@ -73,6 +73,21 @@ def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], ...
     return tuple(without_nodes), tuple(plan.removed), tuple(closed), tuple(sides)
 
 
+def lit(plan: EditPlan, model: SceneModel) -> None:
+    """Give a plan's new objects, and those that are kept in another street, the light of the street where they will be.
+
+    Args:
+        model: the fitted scene to be edited.
+    """
+    here = edited.surface_light(model)
+    there = here if plan.background is None else edited.surface_light(plan.background[0].model)
+    for name, insertion in plan.inserted.items():
+        if insertion.match_light:
+            plan.inserted[name] = replace(insertion, asset=edited.matched_light(insertion.asset, there)[0], match_light=False)
+    if plan.background is not None and plan.match_objects:
+        plan.objects_gain = edited.light_gain(here, there)
+
+
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= MOST_NAMED else f"{len(names)} objects"
 
@@ -87,13 +102,14 @@ def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None, str
     if plan.background is not None:
         other, pose = plan.background
         model = edited.with_background(model, other.model, pose)
+        if plan.objects_gain is not None:
+            model = edited.with_relit_objects(model, plan.objects_gain)
     kept = {node.name: node for node in model.nodes if isinstance(node, RigidNode)}
     changed = {name: plan.changed(name, edited.motion_of(kept[name])) for name in plan.changes if name in kept}
     model = edited.with_motions(model, changed)
     for name, insertion in plan.inserted.items():
-        asset = edited.matched_light(insertion.asset, model)[0] if insertion.match_light else insertion.asset
         actor = plan.after.actors[name]
-        model = edited.with_asset(model, asset, name, actor.motion, actor.label)
+        model = edited.with_asset(model, insertion.asset, name, actor.motion, actor.label)
         if insertion.shadow > 0:
             model = edited.with_shadow(model, name, insertion.shadow, insertion.sun)
     if sky is not None and plan.sky is not None:
@@ -178,7 +194,7 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
     if plan.background is not None:
         static = _other_street(*plan.background)
-        objects = {name: points for name, points in objects.items() if name not in standing}
+        objects = {name: _relit_points(points, plan.objects_gain) for name, points in objects.items() if name not in standing}
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     return FusedCloud(static, objects, cloud.colors)
 
@@ -193,6 +209,13 @@ def _other_street(other: Background, world_from_other: NDArray[np.float64]) -> P
         raise UsageError("the other run has no fused points", remedy="name a folder made by `mudg run`")
     xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
     return replace(other.points, xyz=xyz.astype(np.float32))
+
+
+def _relit_points(points: PointCloud, gain: NDArray[np.float64] | None) -> PointCloud:
+    if gain is None:
+        return points
+    shown = edited.display_of(edited.linear_of(points.rgb / 255) * gain)
+    return replace(points, rgb=np.rint(shown.clip(0, 1) * 255).astype(np.uint8))
 
 
 def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointCloud]:

@@ -2,7 +2,7 @@
 
     means f32[n, 3]  quats f32[n, 4]  log_scales f32[n, 3]  logits f32[n]  sh_dc f32[n, 1, 3]   raw, in the frame of the box
     class_ids u8[n] (255 = unknown)   certainty f16[n], if it is known
-    header "mudg_asset": {schema, label, size_m, road_rgb, seen_deg, origin}
+    header "mudg_asset": {schema, label, size_m, light_rgb, seen_deg, origin}
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class AssetHeader(StrictRecord):
     """Description of an asset file."""
 
-    schema_: Literal[1] = Field(alias="schema")
+    schema_: Literal[2] = Field(alias="schema")
     label: str
     size_m: Annotated[list[Size], Field(min_length=3, max_length=3)]
-    road_rgb: Annotated[list[Number], Field(min_length=3, max_length=3)] | None
+    light_rgb: Annotated[list[Number], Field(min_length=3, max_length=3)] | None
     seen_deg: list[Number]
     origin: str
 
@@ -94,8 +94,8 @@ def write_asset(path: Path, asset: Asset) -> None:
     if asset.certainty is not None:
         arrays["certainty"] = asset.certainty.astype(np.float16)
     header = {
-        "schema": 1, "label": asset.label, "size_m": list(asset.size_m), "origin": asset.origin,
-        "road_rgb": None if asset.road_rgb is None else list(asset.road_rgb),
+        "schema": 2, "label": asset.label, "size_m": list(asset.size_m), "origin": asset.origin,
+        "light_rgb": None if asset.light_rgb is None else list(asset.light_rgb),
         "seen_deg": [round(float(np.degrees(a)), 2) for a in asset.seen_rad],
     }  # fmt: skip
     store.write_safetensors(path, arrays, {HEADER: store.json_text(header, indent=None)})
@@ -128,6 +128,6 @@ def read_asset(path: Path) -> Asset:
     return Asset(
         {key: torch.from_numpy(arrays[key].copy()) for key in _SHAPES}, np.where(ids < len(CLASSES), ids, -1),
         None if known is None or known.shape != (count,) else known.astype(np.float32), header.label, (length, width, height),
-        None if header.road_rgb is None else (header.road_rgb[0], header.road_rgb[1], header.road_rgb[2]),
+        None if header.light_rgb is None else (header.light_rgb[0], header.light_rgb[1], header.light_rgb[2]),
         tuple(float(a) for a in np.radians(header.seen_deg)), header.origin,
     )  # fmt: skip

@@ -27,6 +27,7 @@ from mudg.stages.editing.apply import (
     edited_scene,
     ego_fact,
     ground_of,
+    lit,
     street_left,
 )
 from mudg.stages.editing.assets import asset_from, read_asset
@@ -90,6 +91,7 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     background = lambda name: background_of(find_run(script.path_of(name)), name)  # noqa: E731
     closes = scene is not None and is_recording(scene)
     plan = plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
+    lit(plan, model)
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
     if scene is None and plan.closed:
         plan.notes.append({"kind": "street not closed", "ids": sorted(plan.closed),

@@ -121,6 +121,8 @@ class EditPlan:
         changes: what is done to the path of an actor of the recording, in order.
         removed: actors of the recording that are not there any more. inserted: new ones, by id.
         sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
+        match_objects: whether the objects that are kept take the light of that street. objects_gain: by which factor f64[3] of
+            their linear light, or None.
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
@@ -135,6 +137,8 @@ class EditPlan:
     inserted: dict[str, Insertion] = field(default_factory=dict)
     sky: Any = None
     background: tuple[Background, np.ndarray] | None = None
+    match_objects: bool = False
+    objects_gain: np.ndarray | None = None
     conditions: dict[str, Any] = field(default_factory=dict)
     notes: list[dict[str, Any]] = field(default_factory=list)
     moves_ego: bool = False
@@ -382,7 +386,7 @@ def _background(plan: EditPlan, given: Any, sources: EditSources) -> None:
     for name in list(plan.after.actors):
         _change(plan, name, again)
     _change(plan, EGO, again)
-    plan.background = other, pose
+    plan.background, plan.match_objects = (other, pose), given.match_light
     plan.after = replace(plan.after, ground=new)
     plan.notes += _seams(plan.after, new)
 
