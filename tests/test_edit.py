@@ -37,9 +37,10 @@ from mudg.models.scene.nodes import DeformableNode, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
 from mudg.stages.config import DEMO_CITY
 from mudg.stages.editing import assets
-from mudg.stages.editing.apply import edited_cloud, edited_model, lit
+from mudg.stages.editing.apply import edited_cloud, edited_model
 from mudg.stages.editing.carried import carry_out
 from mudg.stages.editing.checks import collisions
+from mudg.stages.editing.light import surface_light, take_light
 from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.fitting.rendering import render_view
 
@@ -370,39 +371,30 @@ def test_what_is_no_asset_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_asset_takes_the_light_of_the_scene() -> None:
-    bright = toy()
-    dark = toy()
-    with torch.no_grad():
-        rows = dark.table.labels["node"] == 0
-        dark.table["sh_dc"][rows] = (0.25 - 0.5) / SH_C0
-    lit, gain = edited.matched_light(edited.asset_of(bright, "car-1"), edited.surface_light(dark))
-    linear = lambda v: ((v + 0.055) / 1.055) ** 2.4  # noqa: E731
-    assert gain == pytest.approx(linear(0.25) / edited.surface_light(bright), rel=1e-4)
-    same, one = edited.matched_light(edited.asset_of(bright, "car-1"), edited.surface_light(bright))
-    assert one == pytest.approx([1, 1, 1])
-    before, after = (0.5 + SH_C0 * a.columns["sh_dc"] for a in (edited.asset_of(bright, "car-1"), same))
-    assert torch.allclose(before.clamp(min=0), after.clamp(min=0), atol=1e-3)
-
-
-def test_the_light_of_surfaces_counts_opacity_and_area_of_the_background() -> None:
-    model = toy()
-    still = model.table.labels["node"] == 0
-    with torch.no_grad():
-        model.table["sh_dc"][still] = (0.4 - 0.5) / SH_C0
-        model.table["sh_dc"][:300] = (0.8 - 0.5) / SH_C0
-        model.table["log_scales"][still] = torch.log(torch.tensor([0.3, 0.2, 0.01]))
-        model.table["logits"][still] = 0.0
-        model.table["log_scales"][:300, 1] += np.log(2.0)
-        model.table["logits"][:300] = -np.log(3.0)  # opacity 1/4
-        model.table["sh_dc"][~still] = 7.0
-    bright, dark = edited.linear_of(np.array([0.8, 0.4]))
-    area = [2 / 4 * 300, 1 / 2 * 340]
-    assert edited.surface_light(model) == pytest.approx([(bright * area[0] + dark * area[1]) / sum(area)] * 3, rel=1e-5)
-    assert edited.surface_light(model.without_nodes([])) is not None
-    few = replace(model, table=Table(*({k: v[600:] for k, v in part.items()} for part in (model.table.columns, model.table.labels))))
-    assert edited.surface_light(few) is None
-    assert edited.light_gain(None, np.ones(3)) == pytest.approx([1, 1, 1])
+    here, there = np.array([0.2, 0.1, 0.3]), np.array([0.1, 0.1, 0.6])
+    asset = edited.asset_of(toy(), "car-1", light_rgb=here)
+    lit, gain = edited.matched_light(asset, there)
+    assert gain == pytest.approx([2**-0.75, 1, 2**0.75])
+    before, after = (edited.linear_of((0.5 + SH_C0 * a.columns["sh_dc"].double().numpy()).clip(0)) for a in (asset, lit))
+    assert after == pytest.approx(before * gain, rel=1e-4, abs=1e-6)
+    assert edited.matched_light(asset, None)[1] == pytest.approx([1, 1, 1])
+    assert edited.matched_light(edited.asset_of(toy(), "car-1"), there)[1] == pytest.approx([1, 1, 1])
     assert edited.light_gain(np.full(3, 0.01), np.full(3, 0.9)) == pytest.approx([4, 4, 4])
+
+
+def test_the_light_of_surfaces_is_that_of_the_pixels_that_show_them() -> None:
+    """Ground of two greys under a white sky, which must not count."""
+    model = toy()
+    with torch.no_grad():
+        model.sky.table["panorama"].fill_(1.0)
+        model.table["sh_dc"].fill_((0.2 - 0.5) / SH_C0)
+    seen = surface_light(model, [view(t) for t in (0.2, 0.9)])
+    observed = render_view(model, view(0.2), RasterConfig(backend="torch"))
+    assert 0.1 < (observed.depth > 0).float().mean() < 0.9
+    surface = edited.linear_of(np.array(0.2))
+    assert surface * 0.98 < seen.min() and seen.max() < surface + 0.5 * (1 - surface)  # edges blend with the sky
+    assert surface_light(model, []) is None
+    assert surface_light(model.without_nodes([]), [view(0.2)]) == pytest.approx(surface_light(model, [view(0.2)]))
 
 
 def test_objects_take_the_light_of_another_street() -> None:
@@ -410,9 +402,10 @@ def test_objects_take_the_light_of_another_street() -> None:
     model, dim = toy(), toy()
     with torch.no_grad():
         dim.table["sh_dc"][dim.table.labels["node"] == 0] = (0.2 - 0.5) / SH_C0
-    gain = edited.light_gain(edited.surface_light(model), edited.surface_light(dim))
-    assert gain.max() < 0.5
-    asset = edited.asset_of(model, "car-1")
+    here, there = (surface_light(scene, [view()]) for scene in (model, dim))
+    gain = edited.light_gain(here, there)
+    assert gain.max() < 0.9
+    asset = edited.asset_of(model, "car-1", light_rgb=here)
     ego = Motion.recorded([0.0, 2.0], np.stack([geometry.yaw_matrix(0.0)] * 2))
     x, y = np.meshgrid(np.arange(-6, 40, 0.5), np.arange(-8, 8, 0.5), indexing="ij")
     ground = np.stack([x, y, 0 * x], -1).reshape(-1, 3)
@@ -424,8 +417,10 @@ def test_objects_take_the_light_of_another_street() -> None:
 
     def made(background: str, insert: str) -> tuple[SceneModel, FusedCloud]:
         text = f"- insert: {{{place}{insert}}}\n- background: {{run: other{background}}}"
-        plan = planned(text, world, lambda source: asset, lambda name: Background(dim, ego, ground, street))
-        lit(plan, model)
+        plan = planned(text, world, lambda source: asset, lambda name: Background(dim, ego, ground, street, there))
+        plan.views = (view(),)
+        take_light(plan, model)
+        assert not [note for note in plan.notes if note["kind"] == "light not matched"]
         return edited_model(model, plan), edited_cloud(cloud, plan)
 
     def shown(scene: SceneModel, name: str) -> float:
@@ -440,6 +435,10 @@ def test_objects_take_the_light_of_another_street() -> None:
         assert after / before == pytest.approx(gain[0], rel=0.05)
     assert cloud_plain.objects["car-1"].rgb.max() == 200 and cloud_full.static.rgb.max() == 90
     assert shown(plain, "car-1") == pytest.approx(shown(model, "car-1"))
+    blind = planned(f"- insert: {{{place}}}", world, lambda source: asset)
+    take_light(blind, model)
+    assert [note["ids"] for note in blind.notes] == [["new"]]
+    assert torch.allclose(blind.inserted["new"].asset.columns["sh_dc"], asset.columns["sh_dc"], atol=1e-5)
 
 
 def test_a_contact_shadow_darkens_the_ground_by_its_strength() -> None:

@@ -34,6 +34,7 @@ CUT_MARGIN_M: Final = 0.1
 """A box that is cut out of the background takes what lies this far beside it, too."""
 CUT_FLOOR_M: Final = 0.12
 """What lies this low above the bottom of a box belongs to the ground, unless its class says otherwise."""
+LIGHT_EXPONENT: Final = 0.75
 SOLID_OPACITY: Final = 0.3
 ABSENT_LOGIT: Final = -10.0
 """Class logit of an inserted object for classes that only the other scene knows."""
@@ -121,21 +122,6 @@ def lowest_points(model: SceneModel) -> NDArray[np.float32]:
     _, begins, counts = np.unique(cells[order], axis=0, return_index=True, return_counts=True)
     rank = np.arange(len(order)) - np.repeat(begins, counts)
     return means[order[rank < np.repeat(np.ceil(counts / 5), counts)]]
-
-
-def surface_light(model: SceneModel) -> NDArray[np.float64] | None:
-    """Mean light f64[3] that the surfaces of a scene give off, linear; None where the background has fewer than 50 Gaussians.
-
-    Background Gaussians count by opacity and area (the product of their two longest axes, at most its 99th percentile), objects do not.
-    """
-    rows = (model.table.labels["node"] == 0).cpu().numpy()
-    if rows.sum() < 50:
-        return None
-    values = (model.table[name].detach().cpu().numpy()[rows].astype(np.float64) for name in ("sh_dc", "log_scales", "logits"))
-    color, log_scales, logits = values
-    area = np.exp(np.sort(log_scales, 1)[:, 1:].sum(1))
-    weight = np.minimum(area, np.percentile(area, 99)) / (1 + np.exp(-logits.reshape(-1)))
-    return np.average(linear_of((0.5 + SH_C0 * color[:, 0]).clip(0, 1)), 0, weight)
 
 
 def cut_out(model: SceneModel, track: Track) -> SceneModel:
@@ -237,7 +223,7 @@ class Asset:
         class_ids: train id of every Gaussian, i64[n]; -1 = unknown.
         certainty: f32[n] in [0, 1] or None.
         label, size_m: of its box.
-        light_rgb: mean light of the surfaces of its scene (``surface_light``), or None.
+        light_rgb: mean light of the surfaces of its scene, linear, or None.
         seen_rad: from which sides it was recorded: angles from its front, counter-clockwise.
         origin: where it comes from, for people.
     """
@@ -255,7 +241,9 @@ class Asset:
         return len(self.class_ids)
 
 
-def asset_of(model: SceneModel, name: str, seen_rad: Sequence[float] = (), origin: str = "") -> Asset:
+def asset_of(
+    model: SceneModel, name: str, seen_rad: Sequence[float] = (), origin: str = "", light_rgb: NDArray[np.float64] | None = None
+) -> Asset:
     """An object of a fitted scene. What deforms is taken as it is in the middle of its track.
 
     Raises:
@@ -267,11 +255,11 @@ def asset_of(model: SceneModel, name: str, seen_rad: Sequence[float] = (), origi
     columns = {key: model.table[key].detach()[rows].cpu() for key in ("means", "quats", "log_scales", "logits", "sh_dc")}
     if type(node) is not RigidNode:
         columns |= _shape_at_middle(model, node, rows)
-    light, known = surface_light(model), model.certainty
+    known = model.certainty
     size = (node.size_m[0], node.size_m[1], node.size_m[2])
     return Asset(
         columns, classes_of_rows(model)[rows.cpu().numpy()], None if known is None else known[rows].float().cpu().numpy(),
-        node.label, size, None if light is None else (float(light[0]), float(light[1]), float(light[2])),
+        node.label, size, None if light_rgb is None else (float(light_rgb[0]), float(light_rgb[1]), float(light_rgb[2])),
         tuple(float(a) for a in seen_rad), origin or f"{model.facts.get('scene', 'a scene')}: {name}",
     )  # fmt: skip
 
@@ -293,7 +281,7 @@ def _shape_at_middle(model: SceneModel, node: RigidNode, rows: Tensor) -> dict[s
 
 
 def matched_light(asset: Asset, there: NDArray[np.float64] | None) -> tuple[Asset, NDArray[np.float64]]:
-    """The asset in the light of a scene (its ``surface_light``), and the gain of each channel, f64[3], in linear light (``light_gain``)."""
+    """The asset in the light of a scene (mean light f64[3] of its surfaces), and the gain f64[3] of its linear light (``light_gain``)."""
     gain = light_gain(None if asset.light_rgb is None else np.asarray(asset.light_rgb), there)
     return replace(asset, columns={**asset.columns, "sh_dc": relit(asset.columns["sh_dc"], gain)}), gain
 
@@ -301,19 +289,23 @@ def matched_light(asset: Asset, there: NDArray[np.float64] | None) -> tuple[Asse
 def light_gain(here: NDArray[np.float64] | None, there: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """Factor f64[3] from the light of one scene to that of another, in linear light.
 
-    The surfaces of two streets are taken to reflect alike on the whole, so that the ratio of their mean light is that of illumination and
-    exposure (the assumption of a grey world). Kept within 1/4 to 4; 1 where either is not known.
+    The surfaces of two streets are taken to reflect alike on the whole (the assumption of a grey world), so that the ratio of their mean
+    light is that of illumination and exposure, but for what the streets are made of: hence the exponent, which is the slope of the true
+    factor over the ratio, both as logarithms, for vehicles in 17 generated cities. Kept within 1/4 to 4; 1 where either is not known.
 
     Args:
-        here, there: mean light of surfaces f64[3] (``surface_light``).
+        here, there: mean light of surfaces f64[3], linear.
     """
-    return np.ones(3) if here is None or there is None else (there / np.maximum(here, 1e-4)).clip(0.25, 4.0)
+    if here is None or there is None:
+        return np.ones(3)
+    return ((there / np.maximum(here, 1e-4)) ** LIGHT_EXPONENT).clip(0.25, 4.0)
 
 
 def relit(sh_dc: Tensor, gain: NDArray[np.float64]) -> Tensor:
-    """Colours of degree 0 f32[n, 1, 3] with their linear light multiplied by a gain f64[3]."""
+    """Colours of degree 0 f32[n, 1, 3] with their linear light multiplied by a gain f64[3]; what is below black stays."""
     shown = 0.5 + SH_C0 * sh_dc.detach().cpu().double().numpy()
-    return torch.from_numpy((display_of(linear_of(shown) * gain) - 0.5) / SH_C0).to(sh_dc)
+    lit = np.where(shown > 0, display_of(linear_of(shown) * gain), shown)
+    return torch.from_numpy((lit - 0.5) / SH_C0).to(sh_dc)
 
 
 def linear_of(display: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -73,21 +73,6 @@ def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], ...
     return tuple(without_nodes), tuple(plan.removed), tuple(closed), tuple(sides)
 
 
-def lit(plan: EditPlan, model: SceneModel) -> None:
-    """Give a plan's new objects, and those that are kept in another street, the light of the street where they will be.
-
-    Args:
-        model: the fitted scene to be edited.
-    """
-    here = edited.surface_light(model)
-    there = here if plan.background is None else edited.surface_light(plan.background[0].model)
-    for name, insertion in plan.inserted.items():
-        if insertion.match_light:
-            plan.inserted[name] = replace(insertion, asset=edited.matched_light(insertion.asset, there)[0], match_light=False)
-    if plan.background is not None and plan.match_objects:
-        plan.objects_gain = edited.light_gain(here, there)
-
-
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= MOST_NAMED else f"{len(names)} objects"
 

@@ -27,6 +27,7 @@ from mudg.models.scene.model import SceneModel
 from mudg.models.scene.sides import with_closed_sides
 from mudg.stages.editing.apply import views_of
 from mudg.stages.editing.checks import sides_seen
+from mudg.stages.editing.light import surface_light
 from mudg.stages.editing.plan import Actor
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.fitting.rendering import raster_of
@@ -84,7 +85,7 @@ def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset
     node = model.dynamic_object(name)
     actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), motion_of(node))
     closed = with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
-    return asset_of(closed, name, sides_seen(actor, views).tolist())
+    return asset_of(closed, name, sides_seen(actor, views).tolist(), light_rgb=surface_light(model, views))
 
 
 def write_asset(path: Path, asset: Asset) -> None:

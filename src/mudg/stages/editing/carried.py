@@ -27,11 +27,11 @@ from mudg.stages.editing.apply import (
     edited_scene,
     ego_fact,
     ground_of,
-    lit,
     street_left,
 )
 from mudg.stages.editing.assets import asset_from, read_asset
 from mudg.stages.editing.checks import check, shown_anew
+from mudg.stages.editing.light import surface_light, take_light
 from mudg.stages.editing.plan import Background, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.editing.weathered import conditions_of
@@ -91,8 +91,8 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     background = lambda name: background_of(find_run(script.path_of(name)), name)  # noqa: E731
     closes = scene is not None and is_recording(scene)
     plan = plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
-    lit(plan, model)
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
+    take_light(plan, model)
     if scene is None and plan.closed:
         plan.notes.append({"kind": "street not closed", "ids": sorted(plan.closed),
                            "text": f"the street behind {', '.join(sorted(plan.closed))} stays as it was fitted: what recorded views show "
@@ -129,7 +129,8 @@ def background_of(parts: RunParts, name: str) -> Background:
         ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
     if not len(ground):
         raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
-    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud)
+    light = surface_light(model, [frame.view for frame in scene.frames])
+    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud, light)
 
 
 def opener(script: EditScript) -> Callable[[AssetSource], Asset]:

@@ -34,12 +34,14 @@ OpenAsset = Callable[[AssetSource], Asset]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground, and its fused points, if they are known."""
+    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground; its fused points and the mean light f64[3] of its
+    surfaces, if they are known."""
 
     model: SceneModel
     ego: Motion
     ground_xyz: np.ndarray
     points: PointCloud | None = None
+    light_rgb: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +112,11 @@ class Insertion:
     shadow: float
     match_light: bool
     sun: np.ndarray | None = None
+
+
+def replaced_asset(insertion: Insertion, asset: Asset) -> Insertion:
+    """The same with an object that has the light of the scene."""
+    return replace(insertion, asset=asset, match_light=False)
 
 
 @dataclass(slots=True, eq=False)
