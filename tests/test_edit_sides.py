@@ -101,6 +101,22 @@ def test_only_what_is_seen_from_another_side_is_closed() -> None:
     assert sides("- move: {id: car, left_m: 2, close_sides: false}") == set()
 
 
+def test_sides_are_closed_where_the_vehicle_takes_another_path() -> None:
+    sources = EditSources(lambda s: None, lambda n: None)  # type: ignore[arg-type,return-value]
+    ego = Motion.recorded(np.array(TIMES, float), np.stack([geometry.yaw_matrix(0.0)] * len(TIMES)))
+    away = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam, view.time_s) for view in VIEWS]
+
+    def sides(text: str, views: list[View]) -> set[str]:
+        plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), sources)
+        return plan.sides & shown_anew(plan, VIEWS, views)
+
+    assert sides("- move: {id: ego, left_m: 2}", away) == {"car"}
+    assert sides("- move: {id: ego, left_m: 2}", VIEWS) == set()
+    assert sides("- move: {id: ego, left_m: 2, close_sides: false}", away) == set()
+    assert sides("- move: {id: ego, left_m: 2}\n- remove: {ids: [car]}", away) == set()
+    assert sides("- remove: {ids: [car]}", away) == set()
+
+
 def test_an_asset_has_all_its_sides() -> None:
     model = behind()
     asset = complete_asset(model, "car", VIEWS)

@@ -114,10 +114,10 @@ def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequ
 
 
 def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> set[str]:
-    """Objects of the recording of whose changed paths some view shows a side that no recorded view shows, from more than
-    `ANOTHER_SIDE_RAD` away."""
+    """Objects of the recording of which some view shows a side that no recorded view shows, from more than `ANOTHER_SIDE_RAD` away,
+    because their path or that of the vehicle has changed."""
     found = set()
-    for name in plan.changes:
+    for name in plan.before.actors if plan.moves_ego else plan.changes:
         if name not in plan.before.actors or name not in plan.after.actors:
             continue
         asked = sides_seen(plan.after.actors[name], views_after)

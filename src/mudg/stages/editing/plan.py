@@ -184,7 +184,8 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
         except (InputError, UsageError) as problem:
             raise _located(problem, edit) from problem
     plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
-    plan.sides &= set(plan.changes)
+    others = set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted) if EGO in plan.sides else set()
+    plan.sides = plan.sides & set(plan.changes) - {EGO} | others  # from another path of the vehicle, all are seen anew
     return plan
 
 
