@@ -589,8 +589,10 @@ def test_the_city_is_drawn_again_with_another_look() -> None:
     seen = drawn.render(frame)
     assert (seen.instance == number).any() and (seen.rgb != truth.rgb).any()
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
-    gone = {name: None}
-    assert np.array_equal(drawn.rearranged(gone).render(frame).rgb, city.rearranged(gone).render(frame).rgb)
+    with pytest.raises(UsageError, match="no such object"):
+        city.recast("car-999", look)
+    gone = {drawn.tracks()[number - 1].id: None}
+    assert np.array_equal(drawn.rearranged(gone).render(frame).rgb, city.rearranged({name: None}).render(frame).rgb)
 
 
 def test_another_street_lies_where_the_vehicle_drives() -> None:

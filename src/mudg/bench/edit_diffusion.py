@@ -181,7 +181,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def with_diffusion(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
+def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     """`mudg bench edit`: the edits of fitted scenes, vehicles of other cities, and, if asked for, what a diffusion model adds."""
     result, text = bench_edit.measure(config, out)
     if len(result["cities"]) > 1:

@@ -35,7 +35,7 @@ WAYS: Final = {"light matched": "true", "as recorded": "false"}
 Seen = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 FEWEST_PX: Final = 30
 """A frame counts if it shows so many pixels of the vehicle."""
-_NUMBERS: Final = ("psnr", "psnr_recorded", "perceptual", "perceptual_recorded", "light")
+_AVERAGED: Final = ("psnr", "psnr_recorded", "perceptual", "perceptual_recorded")
 
 
 def _rows_of_pair(case: EditCase, giver: EditCase, out: Path) -> list[dict[str, Any]]:
@@ -83,7 +83,7 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for way in WAYS:
         mine = [row for row in rows if row["way"] == way and row["psnr"] is not None]
         if mine:
-            means = {key: float(np.mean([row[key] for row in mine])) for key in _NUMBERS[:-1]}
+            means = {key: float(np.mean([row[key] for row in mine])) for key in _AVERAGED}
             off = float(np.exp(np.sqrt(np.mean(np.log([row["light"] for row in mine]) ** 2))))
             made.append({"way": way, "cities": len(mine), **means, "light": off})
     return made

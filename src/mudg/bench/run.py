@@ -168,6 +168,6 @@ def _seam_text(found: dict[str, Any]) -> str:
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
     "mdm": _mdm,
     "poses": bench_poses.measure,
-    EDIT: edit_diffusion.with_diffusion,
+    EDIT: edit_diffusion.measure,
 }
 """Every measurement that is one folder, by name."""

@@ -101,27 +101,26 @@ class CityWorld:
     def __init__(self, config: CityConfig) -> None:
         self.config = config
         self.plan: StreetPlan = plan_streets(config)
-        self.light_name: str = light_numbers(config)[0]
+        self.light_name, self._light = light_numbers(config)
         self._ego_times, self._ego_poses = ego_keys(config, self.plan)
         self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
         self._key_times = key_times(config)
-        furniture = furnish(config, self.plan)
-        self.lamps: NDArray[np.float64] = lamp_places(furniture + [m.row for m in self.objects])
+        self._furniture = furnish(config, self.plan)
+        self.lamps: NDArray[np.float64] = lamp_places(self._furniture + [m.row for m in self.objects])
         no_keys = np.zeros((len(self._key_times), 0, 4))
         self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
-        self._handle = self._handle_with(furniture)
+        self._handle = self._native_world()
         self._cameras = rig.cameras(config)
         self._mounts = rig.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)
 
-    def _handle_with(self, furniture: list[list[float]]) -> CityHandle:
+    def _native_world(self) -> CityHandle:
         """The native world of all shapes, in its light and weather."""
         config = self.config
-        records = np.array(furniture + [m.row for m in self.objects], np.float64).reshape(-1, rec.COLUMNS)
-        road, light, seed = _road_numbers(config, self.plan), light_numbers(config)[1], _seed31(config, "city surfaces")
-        handle = CityHandle(records, self.plan, road, light, seed)
+        records = np.array(self._furniture + [m.row for m in self.objects], np.float64).reshape(-1, rec.COLUMNS)
+        handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), self._light, _seed31(config, "city surfaces"))
         for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
             handle.set_texture(slot, rgb, metres)
         numbers = weather_numbers(config)
@@ -152,33 +151,40 @@ class CityWorld:
         Args:
             keys: track id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not there.
         """
-        known = {track.id: index for index, track in enumerate(self.tracks())}
         moved = self._keys.copy()
         for track_id, values in keys.items():
-            if track_id not in known:
-                raise UsageError("the city has no such object", expected=", ".join(known), got=track_id)
+            index = self._index_of(track_id)
             if values is None:
-                moved[:, known[track_id], 2] = -FAR_BELOW_M
+                moved[:, index, 2] = -FAR_BELOW_M
             else:
-                moved[:, known[track_id]] = values
+                moved[:, index] = values
         other = copy.copy(self)
         other._keys = moved
         return other
+
+    def _index_of(self, track_id: str) -> int:
+        known = [track.id for track in self.tracks()]
+        if track_id not in known:
+            raise UsageError("the city has no such object", expected=", ".join(known), got=track_id)
+        return known.index(track_id)
 
     def recast(self, track_id: str, look: PosedObject) -> CityWorld:
         """The same world, light and shadows included, with another object on the path of a vehicle or person.
 
         Args:
             look: whose shape, size and paint it gets, for example an object of another world.
+
+        Raises:
+            UsageError: the city has no such object.
         """
-        index = self.instance_of(track_id) - 1
+        index = self._index_of(track_id)
         mine = self.objects[index]
         objects = list(self.objects)
         objects[index] = PosedObject([*look.row[:-1], mine.row[-1]], mine.keys, look.gait_rad_per_s, mine.moving)
         other = copy.copy(self)
         other.objects = tuple(objects)
         other._gaits = np.array([m.gait_rad_per_s for m in objects], np.float64)
-        other._handle = other._handle_with(furnish(self.config, self.plan))
+        other._handle = other._native_world()
         return other
 
     @property

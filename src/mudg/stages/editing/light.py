@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from mudg.base.types import View
 from mudg.models.scene.edited import light_gain, linear_of, matched_light
 from mudg.models.scene.model import SceneModel
 from mudg.stages.editing.apply import spread
-from mudg.stages.editing.plan import EditPlan, replaced_asset
+from mudg.stages.editing.plan import EditPlan
 from mudg.stages.fitting.rendering import raster_of, render_view
 
 MOST_VIEWS: Final = 8
@@ -50,7 +51,7 @@ def take_light(plan: EditPlan, model: SceneModel) -> None:
     for name in wanting:
         asset = plan.inserted[name].asset
         unknown += [name] if there is None or asset.light_rgb is None else []
-        plan.inserted[name] = replaced_asset(plan.inserted[name], matched_light(asset, there)[0])
+        plan.inserted[name] = replace(plan.inserted[name], asset=matched_light(asset, there)[0], match_light=False)
     if plan.match_objects:
         plan.objects_gain = light_gain(here, there)
         unknown += [] if here is not None and there is not None else ["what was recorded"]

@@ -114,11 +114,6 @@ class Insertion:
     sun: np.ndarray | None = None
 
 
-def replaced_asset(insertion: Insertion, asset: Asset) -> Insertion:
-    """The same with an object that has the light of the scene."""
-    return replace(insertion, asset=asset, match_light=False)
-
-
 @dataclass(slots=True, eq=False)
 class EditPlan:
     """What a script does.
