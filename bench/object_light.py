@@ -67,7 +67,8 @@ def main() -> None:
     roads, surfaces = (np.array(guessed[name]) for name in ("roads", "surfaces"))
     left = {"none": 0 * roads, "ratio of roads": roads, "ratio of surfaces": surfaces}
     left[f"to the power {LIGHT_EXPONENT}"] = LIGHT_EXPONENT * surfaces
-    sys.stdout.write(f"{len(true)} pairs of {len(cases)} cities; best power {(np.array(true) * surfaces).sum() / (surfaces**2).sum():.2f}\n")
+    best = (np.array(true) * surfaces).sum() / (surfaces**2).sum()
+    sys.stdout.write(f"{len(true)} pairs of {len(cases)} cities; best power {best:.2f}\n")
     for name, guess in left.items():
         sys.stdout.write(f"{name:20} {np.sqrt(((np.array(true) - guess) ** 2).mean()):.3f}\n")
 
