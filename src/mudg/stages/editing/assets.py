@@ -112,7 +112,11 @@ def read_asset(path: Path) -> Asset:
     arrays, text = store.parse_safetensors(content, str(path)), store.safetensors_metadata(content, str(path)).get(HEADER)
     if text is None:
         raise InputError("this file is no asset", where=str(path), expected="a file written by `mudg asset export`")
-    header = parse_record(AssetHeader, store.parse_json(text, f"{path}: header"), f"{path}: header: ")
+    facts = store.parse_json(text, f"{path}: header")
+    if isinstance(facts, dict) and facts.get("schema") == 1:
+        raise InputError("this asset was written by an older version", where=str(path), expected="schema 2, with the light of its street",
+            got="schema 1", remedy="export it again with `mudg asset export`")  # fmt: skip
+    header = parse_record(AssetHeader, facts, f"{path}: header: ")
     count = len(arrays["means"]) if "means" in arrays else 0
     wanted = {**{key: (count, *shape) for key, shape in _SHAPES.items()}, "class_ids": (count,)}
     for name, shape in wanted.items():
