@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-MAX_FILE_LINES = 600
-MAX_FUNCTION_LINES = 60  # without the docstring
-MAX_PARAMETERS = 8  # without self and cls
+MAX_FILE_LINES = 900
+MAX_FUNCTION_LINES = 100  # without the docstring
+MAX_PARAMETERS = 10  # without self and cls
 MAX_FILES_IN_STAGES = 16
 
 # Floor of each part of the package; an import may only reach a lower number, or its own part.
