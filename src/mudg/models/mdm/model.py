@@ -25,7 +25,7 @@ from torch.nn import functional
 from mudg.base import palette, scratch, seeds
 from mudg.base.crop import cropped
 from mudg.base.errors import UsageError
-from mudg.base.types import Clip, Condition
+from mudg.base.types import Clip, Condition, FinePatch
 from mudg.core import losses, noise
 from mudg.core.align import align_depth
 from mudg.core.noise import Schedule
@@ -155,6 +155,9 @@ sum."""
 
 RENDER_GATES = 2
 """Their further outputs: how much of the render's colour and of its depth is copied."""
+
+SURROUNDINGS = 8
+"""Latent cells beside a patch that are refined with it in training. What lies farther away changes the losses by 1e-4 of their value."""
 
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
@@ -369,17 +372,8 @@ class MDM(nn.Module):
         if self.finisher is None or not patches:
             return {}
         frames = stated["rgb"].shape[1]
-        latents = {m: z.flatten(0, 1).detach() for m, z in stated.items()}
         with torch.no_grad():
-            small = self._made(self.refine(latents, encoded.pixels, frames, encoded.effect))
-            enlarged = []
-            for number, patch in patches:
-                (h, w), (height, width) = stated["rgb"].shape[-2:], patch.clip.rgb.shape[-2:]
-                size = h * self.codec.factor * patch.scale, w * self.codec.factor * patch.scale
-                top, left = patch.row * patch.scale, patch.column * patch.scale
-                own = slice(number * frames, (number + 1) * frames)
-                clip = Made(*(getattr(small, f.name)[own] for f in fields(small)))
-                enlarged.append(clip.enlarged(size, (top, top + height), (left, left + width)))
+            enlarged = [self._enlarged(stated, encoded, number, patch) for number, patch in patches]
             made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
             given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
             truth = self.pixel_truth([patch.clip for _, patch in patches])
@@ -387,6 +381,20 @@ class MDM(nn.Module):
         done = self.finisher(made, given, frames, scale)
         found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
         return self._pixel_terms(found, truth, settings, "fine")
+
+    def _enlarged(self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch) -> Made:
+        """What denoiser and refiner make of the patch of clip `number`, at the patch's size. Only its surroundings are refined."""
+        frames, *cells = stated["rgb"].shape[1], *stated["rgb"].shape[-2:]
+        factor, own = self.codec.factor, slice(number, number + 1)
+        starts, sides = (patch.row, patch.column), (side // patch.scale for side in patch.clip.rgb.shape[-2:])
+        around = [_around(start, side, factor, count) for start, side, count in zip(starts, sides, cells, strict=True)]
+        tall, wide = (slice(cut.start * factor, cut.stop * factor) for cut in around)
+        latents: dict[Modality, Tensor] = {m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()}
+        pixels = encoded.pixels.map(lambda x: x[number * frames : (number + 1) * frames]).crop(tall, wide)
+        small = self._made(self.refine(latents, pixels, frames, None if encoded.effect is None else encoded.effect[own]))
+        size = (tall.stop - tall.start) * patch.scale, (wide.stop - wide.start) * patch.scale
+        top, left = (patch.row - tall.start) * patch.scale, (patch.column - wide.start) * patch.scale
+        return small.enlarged(size, (top, top + patch.clip.rgb.shape[-2]), (left, left + patch.clip.rgb.shape[-1]))
 
     def _made(self, refined: Refined) -> Made:
         """What the finisher starts from."""
@@ -573,6 +581,13 @@ class _FinePixels:
         found = cropped(self.fine, rows, columns)
         scratch.rest_mapped()
         return self.model._pixels_of(Stacked.of([found]))
+
+
+def _around(start_px: int, side_px: int, factor: int, count: int) -> slice:
+    """The latent cells, of `count`, of a span of pixels with `SURROUNDINGS`; whole pairs, as the refiner's inner blocks take them."""
+    first = max(0, start_px // factor - SURROUNDINGS)
+    last = min(count, -(-(start_px + side_px) // factor) + SURROUNDINGS)
+    return slice(first - first % 2, last + last % 2)
 
 
 def _expected_error(log_error: Tensor) -> Tensor:
