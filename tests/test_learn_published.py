@@ -14,11 +14,12 @@ from toy_clips import write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
+from mudg.base import crop
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Condition
+from mudg.base.types import Condition, SparseDepth
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, build_conditions
+from mudg.data.clips.condition import ConditionRules, build_conditions, filled_depth
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
@@ -224,7 +225,14 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert torch.allclose(given.depth, wanted.depth, rtol=1e-3, atol=1e-3)
     assert bool((given.depth == 0).any()) and not bool(given.warped.any())
     assert torch.allclose(given.color, wanted.color, atol=1 / 500)
-    assert 0 < float(filled.min()) and float(filled.max()) <= 100
+    points = wanted.measured
+    assert torch.isin(filled, points.depth[points.valid].half().float()).all()  # depth that was measured, none mixed with gaps
+    assert torch.equal(given.measured.valid, points.valid)
+    assert torch.allclose(given.measured.depth[points.valid], points.depth[points.valid], rtol=1e-3)
+    cut = crop.cropped(given, slice(3, 9), slice(1, 8)).measured
+    assert torch.equal(cut.depth, given.measured.depth[..., 3:9, 1:8])
+    seen = next(v for n in range(20) if not torch.equal((v := clip_shards.vary(read, np.random.default_rng(n))).depth, read.depth))
+    assert torch.equal(seen.condition.measured.depth, given.measured.depth.flip(-1))
     thinner = from_log.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
@@ -232,7 +240,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
 def test_filling_takes_the_nearest_measured_depth():
     depth = torch.zeros(2, 1, 1, 5)
     depth[0, 0, 0, 1], depth[0, 0, 0, 4] = 7.0, 30.0
-    assert from_log._nearest_depth(depth, 100.0)[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
+    assert filled_depth(SparseDepth(depth, depth > 0))[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
 
 
 def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):

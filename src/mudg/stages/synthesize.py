@@ -434,7 +434,7 @@ class ViewMaker:
 
 def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedClip:
     """The clip with NaN for the depth of what is classed as sky and was not measured."""
-    sky = (clip.semantics == SKY).unsqueeze(1) & ~condition.valid
+    sky = (clip.semantics == SKY).unsqueeze(1) & ~condition.measurement.valid
     return replace(clip, depth=torch.where(sky, torch.nan, clip.depth))
 
 

@@ -34,7 +34,7 @@ from torch.nn import functional
 from mudg.base import geometry, palette, scratch
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
-from mudg.base.types import Condition, FusedCloud, Photo, Track, View
+from mudg.base.types import Condition, FusedCloud, Photo, SparseDepth, Track, View
 from mudg.core.pictures import resize_area
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
@@ -86,7 +86,8 @@ class ConditionRules:
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
     With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour by
-    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in.
+    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes beside it
+    (`Condition.measured`).
     """
 
 
@@ -209,6 +210,14 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
         return rows, columns
     nearest: Any = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     return nearest[0], nearest[1]
+
+
+def filled_depth(measured: SparseDepth, far_m: float = 100.0) -> Tensor:
+    """Depth f32[T,1,H,W] with the nearest measured pixel's where nothing was measured; `far_m` in a frame without any."""
+    filled = []
+    for image, valid in zip(measured.depth[:, 0].numpy(), measured.valid[:, 0].numpy(), strict=True):
+        filled.append(torch.from_numpy(image[nearest_valid(valid)] if valid.any() else np.full_like(image, far_m)))
+    return torch.stack(filled)[:, None]
 
 
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
@@ -488,7 +497,20 @@ def _published_condition(
         color = functional.interpolate(color, size=own[::-1], mode="nearest")
         depth = functional.interpolate(depth, size=own[::-1], mode="bilinear", align_corners=False)
         valid = (color > 0).any(1, keepdim=True) | (depth > 0)
-    return Condition(tuple(views), color, depth, valid, reference)
+    return Condition(tuple(views), color, depth, valid, reference, measured=_measured(cloud, tracks, views, rules))
+
+
+def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], rules: ConditionRules) -> SparseDepth:
+    """What visible points measure at views of the condition's size.
+
+    Points are drawn on a grid at least as fine as the camera's and the condition's, without those that others hide, and each pixel
+    takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is not preferred.
+    """
+    own, seen = (rules.width, rules.height), replace(rules, published=False)
+    grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
+    points = [project_sparse(cloud, tracks, view if grid == own else view.resized(*grid), seen) for view in views]
+    whole = SparseDepth(*(torch.stack([getattr(p, name) for p in points])[:, None] for name in ("depth", "valid")))
+    return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
 
 
 def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> Tensor:

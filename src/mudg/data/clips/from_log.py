@@ -38,8 +38,8 @@ from mudg.data.clips.condition import (
     ConditionRules,
     WarpSource,
     build_conditions,
+    filled_depth,
     image_tensor,
-    nearest_valid,
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
@@ -181,7 +181,8 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
         for name, place, view in zip(window.frames, places, condition.views)
     ]
     rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
-    depth = torch.where(known, depth, _nearest_depth(condition.depth))  # a plausible filling: the noisy input shows it
+    given = condition.depth if condition.measured is None else filled_depth(condition.measured)
+    depth = torch.where(known, depth, given)  # a plausible filling: the noisy input shows it
     return Clip(condition, rgb, depth, known, ids)
 
 
@@ -213,15 +214,6 @@ def _published_condition(
     camera = views[0].camera
     conditions = ConditionRules(rules.width, rules.height, camera.width, camera.height, published=True)
     return build_conditions(cloud, log.scene.tracks, views, [images[places[0]]], conditions)[0], images
-
-
-def _nearest_depth(depth: Tensor, far_m: float = ConditionRules(1, 1).far_m) -> Tensor:
-    """Depth f32[T,1,H,W] with its zeros replaced by the nearest pixel's that has some; `far_m` in a frame without any."""
-    filled = []
-    for image in depth[:, 0].numpy():
-        rows, columns = nearest_valid(image > 0)
-        filled.append(torch.from_numpy(image[rows, columns] if (image > 0).any() else np.full_like(image, far_m)))
-    return torch.stack(filled)[:, None]
 
 
 def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:

@@ -58,6 +58,9 @@ GUIDANCE = 7.5
 GUIDANCE_RESCALE = 0.7
 """Share of the guided velocity whose spread is pulled back to that of the conditional one."""
 
+MEASURED_SLACK_PX = 1
+"""Points are measured on a finer grid than the network's."""
+
 SCALE_ENTRIES = 1400
 """Length of the published table of the dynamic rescale; one entry per noise step is used, the rest repeats the last."""
 
@@ -471,8 +474,9 @@ class PublishedMDM(nn.Module):
         confidence = confidence_of(encoded.seen[0], change, self.codec.factor)
         depth, fits = decoded.depth, list[DepthFit]()
         if request.align:
-            depth, fits = align_depth(depth, condition.depth, condition.valid)
-            confidence = confidence * depth_agreement(depth, condition)
+            points = condition.measurement
+            depth, fits = align_depth(depth, points.depth, points.valid)
+            confidence = confidence * depth_agreement(depth, condition, MEASURED_SLACK_PX)
         return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
 
     def _denoise(
