@@ -14,7 +14,7 @@ from toy_clips import write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
-from mudg.base import crop
+from mudg.base import crop, palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, SparseDepth
 from mudg.data.clips import from_city, from_log
@@ -259,6 +259,8 @@ def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
     (clip,) = from_city.make_clips(replace(rules, width=24, height=16), 0, log)
     condition = clip.condition
     assert len(clip.rgb) == 16 and condition.warped is None
+    sky = (clip.semantics == palette.ID["sky"])[:, None]
+    assert bool(sky.any()) and bool(clip.depth_valid[sky].all()) and bool((clip.depth[sky] == clip_shards.FAR_M).all())
     empty = ~condition.valid
     assert bool(empty.any()) and float((condition.depth * empty).abs().max()) == 0
     assert float((condition.color * empty).abs().max()) == 0

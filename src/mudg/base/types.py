@@ -502,6 +502,7 @@ class Clip:
         shift_m: lateral shift from the recorded path, metres, positive to the left.
         point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
         fine: a rectangle at a higher resolution, or None.
+        depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None: wholly.
     """
 
     condition: Condition
@@ -512,12 +513,19 @@ class Clip:
     shift_m: float = 0.0
     point_color: Tensor | None = None
     fine: FinePatch | None = None
+    depth_confidence: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
         one = (t, 1, h, w)
         checks.check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
-        checks.check_given_tensors(self, point_color=(t, 3, h, w))
+        checks.check_given_tensors(self, point_color=(t, 3, h, w), depth_confidence=one)
+
+    @property
+    def depth_weight(self) -> Tensor:
+        """What depth counts in a loss, f32[T, 1, H, W]: its confidence, 0 where it is not valid."""
+        known = self.depth_valid.float()
+        return known if self.depth_confidence is None else known * self.depth_confidence
 
     def to(self, device: torch.device) -> Clip:
         """The same clip with its tensors on a device."""

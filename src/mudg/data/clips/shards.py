@@ -17,6 +17,8 @@ and, where a fitted scene was rendered,
 
 and, of clips in other weather or light, effect f32[K,8] (`base.effects`)
 
+and, of recorded logs with annotated depth, depth_confidence u8[K,T,H,W] (of 255)
+
 and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0 = nothing
 
 and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column, scale).
@@ -114,6 +116,8 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
     measured = [c.measured for c in conditions if c.measured is not None]
     if measured and len(measured) == len(clips):
         arrays["measured"] = np.stack([f16(m.depth) * m.valid[:, 0].numpy() for m in measured])
+    if any(c.depth_confidence is not None for c in clips):
+        arrays["depth_confidence"] = np.stack([u8(c.depth_weight)[:, 0] for c in clips])
     patches = [clip.fine for clip in clips if clip.fine is not None]
     if patches and len(patches) == len(clips):
         fine = pack_clips([patch.clip for patch in patches], gaps=gaps)
@@ -205,7 +209,7 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
     names = [
         *_PER_FRAME,
-        *(name for name in ("point_color", "measured") if prefix + name in there),
+        *(name for name in ("point_color", "measured", "depth_confidence") if prefix + name in there),
         *(_RENDERS if rendered else ()),
     ]
     found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
@@ -234,6 +238,7 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     return Clip(
         condition, image(found["rgb"]), plane(found["depth"]), (flags & FLAG_DEPTH_UNKNOWN) == 0, found["semantics"].long(), shift_m,
         image(found["point_color"]) if "point_color" in found else None,
+        depth_confidence=plane(found["depth_confidence"]) / 255 if "depth_confidence" in found else None,
     )  # fmt: skip
 
 
@@ -300,6 +305,8 @@ def _mirrored(clip: Clip) -> Clip:
     renders = None if given.renders is None else given.renders.map(flip)
     measured = None if given.measured is None else given.measured.map(flip)
     own = {name: flip(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
+    if clip.depth_confidence is not None:
+        own["depth_confidence"] = flip(clip.depth_confidence)
     return replace(clip, condition=replace(given, **turned, renders=renders, measured=measured), **own, shift_m=-clip.shift_m)
 
 

@@ -335,10 +335,10 @@ class MDM(nn.Module):
 
     def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
         """What the refiner should give for clips or patches of one size."""
-        rgb, depth, valid, ids = (
-            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        rgb, depth, weight, ids = (
+            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
         )
-        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, valid.float())
+        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, weight)
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
         """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""

@@ -339,7 +339,7 @@ class PublishedMDM(nn.Module):
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
             known: dict[Modality, Tensor] = {
-                "depth": self._share_of_cells(torch.stack([clip.depth_valid for clip in clips])),
+                "depth": self._share_of_cells(torch.stack([clip.depth_weight for clip in clips])),
                 "semantics": self._share_of_cells(classes),
             }
         planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))

@@ -87,7 +87,7 @@ def without_classes(clip: Clip) -> Clip:
 def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip and its class confusion i64[19,20]."""
     rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
-    depth = torch.where(clip.depth_valid, clip.depth, clip_shards.FAR_M)  # far depth does not count
+    depth = torch.where(clip.depth_weight == 1, clip.depth, clip_shards.FAR_M)  # far depth does not count, nor does guessed depth
     seen = given.valid if given.warped is None else given.valid | given.warped
     backdrop = given.color if given.backdrop is None else given.backdrop
     frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
