@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from test_learn_parallel import SAME, environment, losses_of
-from toy_clips import write_clips
+from toy_clips import with_settings, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
@@ -27,7 +27,7 @@ from mudg.models.mdm.model import BatchPart, LossSettings
 from mudg.models.published import files as published_files
 from mudg.models.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
 from mudg.stages import convert, fuse, learn, synthesize
-from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages.config import FuseConfig, LearnConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
 
@@ -166,9 +166,9 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
     given, dropped = [], []
     encode = PublishedMDM.encode_condition
 
-    def watched(model, condition, *rest):
+    def watched(model, condition, *rest, **more):
         given.append(bool(torch.equal(condition.reference, condition.color[0])))
-        return encode(model, condition, *rest)
+        return encode(model, condition, *rest, **more)
 
     def noted(model, *rest, dropout, **more):
         dropped.append(dropout.both + dropout.reference)
@@ -183,6 +183,28 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
     assert ContextDropout.for_reference(0.2) == PAPER_DROPOUT
     assert ContextDropout.for_reference(0.1) == ContextDropout(0.05, 0.05, 0.05)  # as the released training code
     assert ContextDropout.for_reference(0.0) == ContextDropout(0.05, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("share", "frame", "matters"), [(1.0, False, True), (1.0, True, False), (0.0, True, True)])
+def test_what_goes_without_the_reference(converted, clips, share, frame, matters):
+    """Left out of tokens and frame, another reference image changes nothing; left out of the tokens alone, frame 0 still shows it."""
+    settings = published_settings(converted, clips)
+    model, _ = learn_models.starting_model(settings)
+    (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
+    other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
+    rules = LossSettings(None, 1.0, share, frame_dropout=frame)
+    with torch.no_grad():
+        loss, again, changed = (float(model([one], BatchPart(0, 0, 0, 1), rules).total) for one in (clip, clip, other))
+    assert loss == again
+    assert (changed != loss) == matters
+
+
+def test_the_scope_of_reference_dropout_reaches_the_loss():
+    rules = [
+        learn._loss_settings(with_settings(LearnConfig(), **given), torch.ones(19))
+        for given in ({}, {"reference_dropout_scope": "tokens_and_frame"})
+    ]
+    assert [rule.frame_dropout for rule in rules] == [False, True]
 
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):

@@ -110,12 +110,14 @@ class LossSettings:
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
     effect_dropout     share of the clips that go without their effect vector; the small kind
+    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the published kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
     effect_dropout: float = 0.0
+    frame_dropout: bool = False
 
 
 @dataclass(frozen=True)

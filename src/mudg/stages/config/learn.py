@@ -33,6 +33,9 @@ class LearnData:
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
     """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released code:
     0.1)."""
+    reference_dropout_scope: Literal["tokens", "tokens_and_frame"] = "tokens"
+    """Published-type models: what such a clip lacks. tokens: the image tokens, as in the released code; frame 0 of the colour condition
+    still shows the reference. tokens_and_frame: frame 0 shows points like all others, too, which the paper's sentence may mean."""
     cities: int = Field(default=240, ge=1)
     """Number of generated cities to train on."""
     skip_cities: int = Field(default=0, ge=0)
