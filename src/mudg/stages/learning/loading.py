@@ -39,6 +39,7 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
         raise UsageError(f"on {device} one process makes all trajectories", where="--processes", expected="0 or 1",
                          got=str(config.processes), remedy="leave it out, or give --device cpu")  # fmt: skip
     config = replace(config, device=str(device))
+    half_of(config)
     published = published_files.is_published(config.model)
     (PublishedMDM if published else MDM).check_request(request_of(config))
     if published and fitted:
