@@ -37,7 +37,7 @@ def standing_in(monkeypatch, depth):
     monkeypatch.setattr(model, "encode_condition", lambda *_: latents)
     monkeypatch.setattr(model, "image_tokens", torch.nn.Identity())
     model.image_tokens.queries = torch.zeros(1)
-    monkeypatch.setattr(model, "_denoise", lambda *_: ({m: cells[0] for m in ("rgb", "depth", "semantics")}, cells[0]))
+    monkeypatch.setattr(model, "_denoise", lambda *_: (dict.fromkeys(("rgb", "depth", "semantics"), cells[0]), cells[0]))
     monkeypatch.setattr(model.codec, "decode", lambda *_: nothing)
     return model
 

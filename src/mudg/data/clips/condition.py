@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ from mudg.base import geometry, palette, scratch
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Condition, FusedCloud, Photo, SparseDepth, Track, View
-from mudg.core.pictures import resize_area
+from mudg.core.pictures import resize_area, to_bytes
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import seen_pixels
@@ -113,6 +113,18 @@ LEAST_FALL = 0.02
 """Metres per metre of depth by which a ray must fall to be followed to the ground."""
 RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
+
+
+class Recolor(Protocol):
+    """Another weather or light for what the published system is given."""
+
+    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of the valid pixels of projected points."""
+        ...
+
+    def photo(self, view: View, rgb: Tensor) -> Tensor:
+        """A recorded image f32[3,H,W]."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +321,8 @@ def build_conditions(
     sources: dict[int, WarpSource] | None = None,
     render_at: RenderAt | None = None,
     vacated_at: VacatedAt | None = None,
+    *,
+    recolor: Recolor | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
 
@@ -320,6 +334,7 @@ def build_conditions(
         render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
             (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
         vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
+        recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
 
     Returns:
         Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
@@ -332,9 +347,9 @@ def build_conditions(
     if not views:
         raise InputError("a condition needs at least one view", where="clips.build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
-    reference = _reference(small[0], recorded, rules)
+    reference = _reference(small[0], recorded, rules, recolor)
     if rules.published:
-        condition = _published_condition(cloud, tracks, small, reference, rules)
+        condition = _published_condition(cloud, tracks, small, reference, rules, recolor)
         return condition, condition
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
@@ -484,14 +499,16 @@ def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Ten
 
 
 def _published_condition(
-    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules
-) -> Condition:
+    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules,
+    recolor: Recolor | None,
+) -> Condition:  # fmt: skip
     own = (rules.width, rules.height)
     native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     seen = views if native == own else [view.resized(*native) for view in views]
     sparse = [project_sparse(cloud, tracks, view, rules) for view in seen]
     valid = torch.stack([s.valid for s in sparse])[:, None]
-    color = torch.stack([s.rgb for s in sparse]) * valid
+    colors = [s.rgb if recolor is None else recolor.points(view, s) for view, s in zip(seen, sparse, strict=True)]
+    color = torch.stack(colors) * valid
     depth = torch.stack([s.depth for s in sparse])[:, None] * valid
     if native != own:
         color = functional.interpolate(color, size=own[::-1], mode="nearest")
@@ -513,7 +530,7 @@ def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View],
     return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
 
 
-def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> Tensor:
+def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, recolor: Recolor | None) -> Tensor:
     own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
     if not own:
         return torch.zeros(3, rules.height, rules.width)
@@ -521,6 +538,8 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> 
     rgb = nearest.rgb
     if nearest.usable is not None and not nearest.usable.all():
         rgb = rgb[nearest_valid(nearest.usable)]
+    if recolor is not None:
+        rgb = to_bytes(recolor.photo(nearest.view, image_tensor(rgb)))
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
         return functional.interpolate(image_tensor(rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
