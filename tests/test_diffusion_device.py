@@ -15,7 +15,7 @@ import torch
 from pretend_device import copies, pretend_device
 from test_published import some_condition
 from toy_clips import HEIGHT, WIDTH, made_up_clip, tiny, with_settings, write_clips
-from toy_published import TINY, published_settings, tiny_checkpoint, tiny_model
+from toy_published import TINY, published_settings, tiny_checkpoint, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base import log, store
@@ -240,6 +240,25 @@ def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
         for i in range(5):
             assert far_apart(a[i].rgb, b[i].rgb) < 1.01 / 255
             assert (a[i].semantics != b[i].semantics).float().mean() < 1e-2
+
+
+def test_float16_is_for_published_type_models_on_cards(street, tmp_path):
+    """Weights and views are in it there; on the CPU, and for other models, it is refused before anything is written."""
+    model, out = write_tiny(tmp_path), tmp_path / "out"
+    config = SynthesizeConfig(shifts_m=(1.0,), model=str(model), steps=2, guidance=1.0, device="cpu", precision="float16")
+    given = street / "scene", street / "fuse"
+    with pytest.raises(UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"):
+        synthesize.run(config, *given, out)
+    here = synthesize.run(replace(config, precision="float32"), *given, tmp_path / "here")
+    with pretend_device():
+        with pytest.raises(UsageError, match="another model on pretend"):
+            synthesize.run(replace(config, model="embedded-tiny", guidance=None, device="pretend"), *given, out)
+        assert not out.exists()
+        assert loading.load_any(replace(config, device="pretend")).dtype == torch.float16
+        there = synthesize.run(replace(config, device="pretend"), *given, out)
+    a, b = read_observations(here / "front_shift+1.0"), read_observations(there / "front_shift+1.0")
+    apart = [float((a[i].rgb - b[i].rgb).abs().mean()) for i in range(5)]
+    assert 0 < max(apart) < 0.02  # measured: see the message of a failure
 
 
 def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_path):

@@ -30,7 +30,7 @@ from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages import fit
-from mudg.stages.config import FitConfig
+from mudg.stages.config import FitConfig, run_preset
 from mudg.stages.fitting import start as fit_start
 from mudg.stages.fitting import trust as fit_trust
 from mudg.stages.fitting import views as fit_views
@@ -379,6 +379,18 @@ def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path
     assert fitted_bytes(folders[0]) != fitted_bytes(folders[1])
     model = fit.load_model(folders[1])
     assert all(torch.isfinite(value).all() for value in model.table.columns.values())
+
+
+def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world, tmp_path, monkeypatch):
+    """Perception, dense depth and classes; the sky has a term on recorded views, and none on virtual ones."""
+    seen: dict[bool, set[str]] = {True: set(), False: set()}
+    monkeypatch.setattr(FiniteCheck, "terms", lambda _, view, terms: seen["virtual_depth" in terms].update(terms))
+    paper = run_preset("paper").fit
+    virtual = replace(paper.virtual, perception="filters", start=0.0, probability=0.5)
+    config = replace(settings("mudg_s", iterations=12), loss=paper.loss, virtual=virtual)
+    fit.run(config, world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"])
+    assert seen[True] == {"virtual_perceptual", "virtual_depth", "virtual_semantics"}
+    assert {"color", "lidar", "sky"} <= seen[False] and "semantics" not in seen[False]
 
 
 def test_lidar_pixels_agree_with_exact_depth(world):

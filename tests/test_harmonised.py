@@ -4,24 +4,32 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
+from toy_published import write_tiny
 from toy_world import fused_cloud, write_scene
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.renders import RenderPlanes
-from mudg.base.types import FusedCloud, Observation, Photo, PointCloud, View
+from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, View
+from mudg.base.weather_settings import Conditions
 from mudg.bench import run as bench
 from mudg.core.edit import Motion
+from mudg.core.weather import DriveFacts
+from mudg.core.weather.gbuffer import Surroundings
+from mudg.core.weather.tone import SRGB
 from mudg.data.clips import vacated as clip_parts
-from mudg.data.clips.condition import build_conditions, image_tensor
-from mudg.data.cloudfile import write_fused
+from mudg.data.clips.ablated import ConditionSources, conditions_of
+from mudg.data.clips.condition import ConditionRules, build_conditions, image_tensor
+from mudg.data.clips.weathered import InWeather
+from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.edits import parse_edits
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_image, read_label, read_scene
@@ -406,3 +414,129 @@ def test_the_benchmark_compares_ways_of_every_edit(tmp_path: Path) -> None:
     assert all(np.isfinite(row[name]) for key, row in rows.items() if key[0] == "remove" for name in ("inside", "uncovered", "perceptual"))
     assert rows["remove", "never there"]["uncovered"] not in {rows["remove", way]["uncovered"] for way in ways}
     assert "+ refit" in (out / "bench.md").read_text(encoding="utf-8")
+
+
+# -- published-type models -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory) -> str:
+    """A tiny model of the published kind, whose clips have 4 frames."""
+    return str(write_tiny(tmp_path_factory.mktemp("published")))
+
+
+def watched(monkeypatch) -> list[Condition]:
+    """Fills with what the published-type model is given."""
+    given, sample = list[Condition](), PublishedMDM.sample
+
+    def noted(model, condition, request):
+        given.append(condition)
+        return sample(model, condition, request)
+
+    monkeypatch.setattr(PublishedMDM, "sample", noted)
+    return given
+
+
+def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own_distances() -> None:
+    """Koschmieder's law: a black wall 12 m ahead has 1 - exp(-3 r / visibility) of the light of what is far away. So have its points,
+    although their depth at the network's size is mixed with gaps, and its photograph, whose distance a render knows."""
+    views = [view_at()]
+    photo = Photo(views[0], np.zeros((32, 48, 3), np.uint8))
+    ids = torch.full((1, 32, 48), ID["building"], dtype=torch.uint8)
+    cloud = FusedCloud(wall(12.0, lambda y: np.zeros((y.size, 3))), {})
+
+    def render(view: View) -> RenderPlanes:
+        one = torch.ones(1, view.camera.height, view.camera.width)
+        return RenderPlanes(0.5 * one.repeat(3, 1, 1), 12 * one, one, one, ids)
+
+    light = Surroundings(*(np.full(3, 0.5) for _ in range(3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.full(3, 0.5))
+    fog = Conditions.model_validate({"weather": {"fog": {"visibility_m": 30}}})
+    how = InWeather(fog, DriveFacts(light), 0, lambda _: (0.0, 0.0, 0.0))
+    rules = ConditionRules(12, 8, 48, 32, published=True)
+    sources = ConditionSources(cloud, [], [photo], rules, render, weather=how)
+    clear = conditions_of(replace(sources, weather=None), "full", views, {})[0]
+    made = conditions_of(sources, "full", views, {})[0]
+    assert torch.equal(made.depth, clear.depth)
+    assert made.effect is None and float(clear.color.max()) == 0 == float(clear.reference.max())
+    colored = made.color[0].amax(0) > 0
+    assert 0.2 < float(colored.float().mean()) <= float(made.valid.float().mean())
+    far = how.image(views[0], torch.zeros(3, 32, 48), torch.full((1, 32, 48), 2000.0), ids)
+    across, down = np.meshgrid((np.arange(48) + 0.5 - 24) / 40, (np.arange(32) + 0.5 - 16) / 40)
+    share = 1 - np.exp(-3 * 12 * np.sqrt(1 + across**2 + down**2) / 30)
+    expected = torch.from_numpy(SRGB.encode(SRGB.decode(far.numpy()) * share)).float()
+    small = torch.nn.functional.interpolate(expected[None], size=(8, 12), mode="bilinear")[0]
+    assert torch.allclose(made.reference, small, atol=0.015)
+    assert torch.allclose(made.color[0][:, colored], expected[:, ::4, ::4][:, colored], atol=0.015)
+
+
+def test_weather_is_generated_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    """Its points and its reference are in the fog; beside the recorded path the first frame, which is the reference, stays as rendered."""
+    log.set_quiet(False)
+    edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 8}}"), run / "fit" / "street_gaussians"
+
+    def rendered(name: str, **settings: Any) -> dict[str, list[Observation]]:
+        harmonize = HarmonizeConfig(on=bool(settings), model=published, steps=1, weather=1.0) if settings else HarmonizeConfig()
+        config = replace(RenderConfig(shifts_m=(0.0, 1.0), video=False), harmonize=harmonize)
+        out = render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse" if settings else None)
+        return {path: views_of(out, path) for path in ("front_recorded", "front_shift+1.0")}
+
+    before, given = rendered("physical"), watched(monkeypatch)
+    made = rendered("made", on=True)
+    assert "no effect vector" not in capsys.readouterr().err
+    for path, frames in made.items():
+        for number, (one, new) in enumerate(zip(before[path], frames, strict=True)):
+            assert torch.equal(one.rgb, new.rgb) == (path != "front_recorded" and number == 0)
+            assert torch.equal(one.semantics, new.semantics)
+    scene, cloud = read_scene(run / "scene"), read_fused(run / "fuse")
+    recorded = synthesize.recorded_images(scene, SynthesizeConfig())
+    rules = ConditionRules(12, 8, 60, 40, published=True)
+    clear = build_conditions(cloud, scene.tracks, given[0].views, recorded, rules)[0]
+    seen = (clear.color[0].amax(0) > 0) & (clear.measured.depth[0, 0] > 8) & clear.measured.valid[0, 0]
+    assert float(given[0].reference.std()) < 0.5 * float(clear.reference.std())  # fog takes contrast
+    assert float(given[0].color[0][:, seen].std()) < 0.5 * float(clear.color[0][:, seen].std())
+
+
+def test_views_are_generated_in_weather_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch) -> None:
+    edits, folders, fitted = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse"), run / "fit" / "street_gaussians"
+    config = SynthesizeConfig(shifts_m=(1.0,), model=published, steps=1, precision="float32")
+    given = watched(monkeypatch)
+    synthesize.run(config, *folders, tmp_path / "day")
+    synthesize.run(config, *folders, tmp_path / "night", fitted=fitted, edits=edits)
+    day, night = given
+    assert float(night.reference.mean()) < 0.6 * float(day.reference.mean())
+    assert float(night.color.mean()) < 0.6 * float(day.color.mean())
+    assert torch.equal(day.depth, night.depth)
+    with pytest.raises(UsageError, match="for weather and light of --edits only"):
+        synthesize.run(config, *folders, tmp_path / "other", fitted=fitted)
+
+
+def test_a_removed_car_is_repaired_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch) -> None:
+    """Only what the edit touched changes."""
+    edits, fitted = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians"
+    given = watched(monkeypatch)
+
+    def rendered(name: str, harmonize: HarmonizeConfig) -> list[Observation]:
+        config = replace(RenderConfig(shifts_m=(0.0,), video=False), harmonize=harmonize)
+        fused = run / "fuse" if harmonize.on else None
+        return views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=fused))
+
+    before = rendered("plain", HarmonizeConfig())
+    made = rendered("made", HarmonizeConfig(on=True, model=published, steps=1, keep_classes=False))
+    assert len(given) == 1
+    changed = [(a.rgb != b.rgb).any(0) for a, b in zip(before, made, strict=True)]
+    assert any(bool(mask.any()) for mask in changed)
+    assert all(float(mask.float().mean()) < 0.5 for mask in changed)
+
+
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"weather": 0.5}, "makes views from noise"), ({"uncovered": 0.3}, "--harmonize.uncovered"), ({"short": True}, "at least 4 frames"),
+])  # fmt: skip
+def test_what_published_type_models_cannot_harmonise_is_refused_first(run: Path, published: str, tmp_path: Path, settings, message) -> None:
+    edits, fitted, scene = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians", run / "scene"
+    if settings.pop("short", False):
+        scene = tmp_path / "scene"
+        write_scene(scene, frames=3, cameras=("front",), width=60, height=40)
+    config = RenderConfig(shifts_m=(0.0,), video=False, harmonize=HarmonizeConfig(on=True, model=published, steps=1, **settings))
+    with pytest.raises(UsageError, match=message):
+        render.run(config, scene, fitted, tmp_path / "out", edits=edits, fused=run / "fuse")
+    assert not (tmp_path / "out").exists()

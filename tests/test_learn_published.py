@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 import torch
 from test_learn_parallel import SAME, environment, losses_of
-from toy_clips import write_clips
+from toy_clips import with_settings, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
+from mudg.base import crop, palette
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Condition
+from mudg.base.types import Condition, SparseDepth
 from mudg.data.clips import from_city, from_log
 from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, build_conditions
+from mudg.data.clips.condition import ConditionRules, build_conditions, filled_depth
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
@@ -26,7 +27,7 @@ from mudg.models.mdm.model import BatchPart, LossSettings
 from mudg.models.published import files as published_files
 from mudg.models.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
 from mudg.stages import convert, fuse, learn, synthesize
-from mudg.stages.config import FuseConfig, SynthesizeConfig
+from mudg.stages.config import FuseConfig, LearnConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
 
@@ -165,9 +166,9 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
     given, dropped = [], []
     encode = PublishedMDM.encode_condition
 
-    def watched(model, condition, *rest):
+    def watched(model, condition, *rest, **more):
         given.append(bool(torch.equal(condition.reference, condition.color[0])))
-        return encode(model, condition, *rest)
+        return encode(model, condition, *rest, **more)
 
     def noted(model, *rest, dropout, **more):
         dropped.append(dropout.both + dropout.reference)
@@ -182,6 +183,28 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
     assert ContextDropout.for_reference(0.2) == PAPER_DROPOUT
     assert ContextDropout.for_reference(0.1) == ContextDropout(0.05, 0.05, 0.05)  # as the released training code
     assert ContextDropout.for_reference(0.0) == ContextDropout(0.05, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("share", "frame", "matters"), [(1.0, False, True), (1.0, True, False), (0.0, True, True)])
+def test_what_goes_without_the_reference(converted, clips, share, frame, matters):
+    """Left out of tokens and frame, another reference image changes nothing; left out of the tokens alone, frame 0 still shows it."""
+    settings = published_settings(converted, clips)
+    model, _ = learn_models.starting_model(settings)
+    (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
+    other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
+    rules = LossSettings(None, 1.0, share, frame_dropout=frame)
+    with torch.no_grad():
+        loss, again, changed = (float(model([one], BatchPart(0, 0, 0, 1), rules).total) for one in (clip, clip, other))
+    assert loss == again
+    assert (changed != loss) == matters
+
+
+def test_the_scope_of_reference_dropout_reaches_the_loss():
+    rules = [
+        learn._loss_settings(with_settings(LearnConfig(), **given), torch.ones(19))
+        for given in ({}, {"reference_dropout_scope": "tokens_and_frame"})
+    ]
+    assert [rule.frame_dropout for rule in rules] == [False, True]
 
 
 def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
@@ -224,7 +247,14 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert torch.allclose(given.depth, wanted.depth, rtol=1e-3, atol=1e-3)
     assert bool((given.depth == 0).any()) and not bool(given.warped.any())
     assert torch.allclose(given.color, wanted.color, atol=1 / 500)
-    assert 0 < float(filled.min()) and float(filled.max()) <= 100
+    points = wanted.measured
+    assert torch.isin(filled, points.depth[points.valid].half().float()).all()  # depth that was measured, none mixed with gaps
+    assert torch.equal(given.measured.valid, points.valid)
+    assert torch.allclose(given.measured.depth[points.valid], points.depth[points.valid], rtol=1e-3)
+    cut = crop.cropped(given, slice(3, 9), slice(1, 8)).measured
+    assert torch.equal(cut.depth, given.measured.depth[..., 3:9, 1:8])
+    seen = next(v for n in range(20) if not torch.equal((v := clip_shards.vary(read, np.random.default_rng(n))).depth, read.depth))
+    assert torch.equal(seen.condition.measured.depth, given.measured.depth.flip(-1))
     thinner = from_log.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
@@ -232,7 +262,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
 def test_filling_takes_the_nearest_measured_depth():
     depth = torch.zeros(2, 1, 1, 5)
     depth[0, 0, 0, 1], depth[0, 0, 0, 4] = 7.0, 30.0
-    assert from_log._nearest_depth(depth, 100.0)[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
+    assert filled_depth(SparseDepth(depth, depth > 0))[:, 0, 0].tolist() == [[7.0, 7.0, 7.0, 30.0, 30.0], [100.0] * 5]
 
 
 def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
@@ -251,6 +281,8 @@ def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
     (clip,) = from_city.make_clips(replace(rules, width=24, height=16), 0, log)
     condition = clip.condition
     assert len(clip.rgb) == 16 and condition.warped is None
+    sky = (clip.semantics == palette.ID["sky"])[:, None]
+    assert bool(sky.any()) and bool(clip.depth_valid[sky].all()) and bool((clip.depth[sky] == clip_shards.FAR_M).all())
     empty = ~condition.valid
     assert bool(empty.any()) and float((condition.depth * empty).abs().max()) == 0
     assert float((condition.color * empty).abs().max()) == 0

@@ -2,15 +2,16 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from toy_clips import tiny, write_clips
+from toy_clips import tiny, with_settings, write_clips
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import Source
+from mudg.base.types import Source, View
 from mudg.core import losses
 from mudg.data.clips import from_log
 from mudg.data.clips import shards as clip_shards
@@ -20,7 +21,8 @@ from mudg.data.scene import SceneWriter, photographs, read_image, read_label, re
 from mudg.models.mdm.model import MDM
 from mudg.stages import fuse, learn
 from mudg.stages.adapting import lessons
-from mudg.stages.config import AdaptConfig, FuseConfig
+from mudg.stages.config import AdaptConfig, FuseConfig, LearnConfig
+from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
@@ -177,3 +179,80 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
         from_log.claim_folder(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):
         learn.run(tiny("", start=str(first), scenes=(str(tmp_path),)), tmp_path / "none")
+
+
+@pytest.fixture(scope="module")
+def annotated(tmp_path_factory):
+    """A street whose frames have made labels: dense depth with a confidence that falls from left to right, twice as far as it is, so
+    that it cannot be mistaken for the sweep; the vehicle's bonnet below."""
+    root = tmp_path_factory.mktemp("annotated")
+    street = ToyStreet(times=[0.1 * n for n in range(8)])
+    bare = street.write(root / "bare", width=120, height=60, labels=False)
+    with SceneWriter(root / "scene", "toy-street", Source("toy", "none")) as writer:
+        writer.copy_all_but_frames(bare)
+        for frame in bare.frames:
+            _, ids, depth = street.image(frame.view)
+            sky, ego = ~np.isfinite(depth), np.zeros(depth.shape, bool)
+            ego[-6:] = True
+            sure = np.broadcast_to(np.linspace(1, 0, depth.shape[1]), depth.shape)
+            labels = {
+                "semantics": ids, "semantics_confidence": np.where(sky, 0.2, 1.0), "depth": np.where(sky, 100.0, 2 * depth),
+                "depth_confidence": sure, "sky": sky, "ego": ego,
+            }  # fmt: skip
+            writer.copy_frame(bare, frame, labels)
+        writer.finish()
+    fuse.run(FuseConfig(min_object_points=1), root / "scene", root / "fuse")
+    return street, LogSource(root / "scene", root / "fuse")
+
+
+@pytest.mark.parametrize("published", [False, True])
+def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, published):
+    """Exact depth where the sweep measured, labelled depth elsewhere; none of the bonnet's."""
+    street, source = annotated
+    rules = LogClipRules(120, 60, window=3, held_out_every=0, published=published)
+    opened, alone = from_log.OpenLog(source, rules), from_log.OpenLog(source, replace(rules, depth="sweep"))
+    window = from_log.log_windows(opened.scene, rules)[0]
+    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True))
+    clip, sweep = clip_shards.read_clip(tmp_path, 0, 0, range(3)), from_log.make_clip(alone, window, 0)
+    assert sweep.depth_confidence is None and 0.05 < float(sweep.depth_valid.float().mean()) < 0.8
+    measured = sweep.depth_valid
+    assert torch.allclose(clip.depth[measured], sweep.depth[measured], rtol=1e-3)
+    assert bool((clip.depth_weight[measured] == 1).all())
+    for number, view in enumerate(clip.condition.views):
+        _, _, exact = street.image(View(view.camera, view.world_from_cam, opened.frame(window.frames[number]).view.time_s))
+        guessed = torch.from_numpy(np.isfinite(exact)) & ~measured[number, 0]
+        guessed[-6:], guessed[:, -1] = False, False  # where nothing is known
+        assert torch.allclose(clip.depth[number, 0][guessed], 2 * torch.from_numpy(exact).float()[guessed], rtol=1e-3)
+        column = torch.linspace(1, 0, 120).expand(60, 120)
+        assert torch.allclose(clip.depth_weight[number, 0][guessed], column[guessed], atol=0.003)
+        bonnet = ~measured[number, 0] & (torch.arange(60)[:, None] >= 54)
+        assert bool(bonnet.any()) and not bool(clip.depth_weight[number, 0][bonnet].any())
+        sky = torch.from_numpy(~np.isfinite(exact)) & ~measured[number, 0]
+        assert bool((clip.depth[number, 0][sky & (column > 0.1)] == clip_shards.FAR_M).all())
+    turned = next(v for n in range(20) if not torch.equal((v := clip_shards.vary(clip, np.random.default_rng(n))).depth, clip.depth))
+    assert torch.equal(turned.depth_weight, clip.depth_weight.flip(-1))
+
+
+def test_the_weight_of_depth_scales_its_loss(annotated):
+    """Both kinds of model: the error at a pixel counts as much as its depth is to be believed."""
+    rules = LogClipRules(64, 32, window=3, held_out_every=0)
+    opened = from_log.OpenLog(annotated[1], rules)
+    clip = from_log.make_clip(opened, from_log.log_windows(opened.scene, rules)[0], 0)
+    model = MDM(learn_models.model_config(tiny(Path(), width=64, height=32, window=3)))
+
+    def term(confidence):
+        truth = model.pixel_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, confidence))])
+        return float(losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0))
+
+    assert term(0.25) == pytest.approx(term(1.0) / 4, rel=1e-4) and term(1.0) > 0
+    cells = model.encode_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, 0.5))]).depth_known
+    assert float(cells.max()) == pytest.approx(0.5)
+
+
+def test_points_are_left_out_of_published_type_clips_only_where_asked():
+    def least(points_alone, **data):
+        config = with_settings(LearnConfig(), **data)
+        return learn_clips._log_rules(config, (64, 32), 0, points_alone).least_points
+
+    assert (least(False), least(True)) == (0.3, 1.0)
+    assert least(True, least_points=0.5) == least(False, least_points=0.5) == 0.5

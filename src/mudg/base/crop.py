@@ -14,7 +14,9 @@ def cropped(condition: Condition, rows: slice, columns: slice) -> Condition:
     width, height = columns.stop - columns.start, rows.stop - rows.start
     lens = {"width": width, "height": height, "cx": width / 2, "cy": height / 2}
     views = tuple(replace(view, camera=replace(view.camera, **lens)) for view in condition.views)
+    cut = lambda x: x[..., rows, columns].contiguous()  # noqa: E731
     found = {name: getattr(condition, name) for name in _MAPS}
-    maps = {name: x[..., rows, columns].contiguous() for name, x in found.items() if x is not None}
-    renders = None if condition.renders is None else condition.renders.map(lambda x: x[..., rows, columns].contiguous())
-    return replace(condition, views=views, renders=renders, **maps)
+    maps = {name: cut(x) for name, x in found.items() if x is not None}
+    renders = None if condition.renders is None else condition.renders.map(cut)
+    measured = None if condition.measured is None else condition.measured.map(cut)
+    return replace(condition, views=views, renders=renders, measured=measured, **maps)

@@ -7,7 +7,7 @@ module imports no torch, so that facts can be read without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
@@ -402,6 +402,21 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SparseDepth:
+    """Measured depth f32[T, 1, H, W] in metres, known where ``valid`` bool[T, 1, H, W] and meaningless elsewhere."""
+
+    depth: Tensor
+    valid: Tensor
+
+    def __post_init__(self) -> None:
+        checks.check_tensors(self, depth=(None, 1, None, None), valid=tuple(self.depth.shape))
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> SparseDepth:
+        """Depth and mask with ``change`` applied to each, for example a crop or a mirror image."""
+        return SparseDepth(change(self.depth), change(self.valid))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Condition:
     """What the diffusion model is given for T views.
 
@@ -417,6 +432,8 @@ class Condition:
         backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
         renders: what a fitted scene shows at the views, or None.
         effect: f32[8] or None: weather and light that the colours have been given (``base.effects``).
+        measured: what the points measured, where ``depth`` is something else: the published system's network is given depth that was
+            resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
     """
 
     views: tuple[View, ...]
@@ -430,6 +447,7 @@ class Condition:
     backdrop_semantics: Tensor | None = None
     renders: RenderPlanes | None = None
     effect: Tensor | None = None
+    measured: SparseDepth | None = None
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
@@ -438,11 +456,19 @@ class Condition:
         checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one, effect=(8,))
         if self.renders is not None:
             checks.check_tensors(self.renders, color=(t, 3, h, w))
+        if self.measured is not None:
+            checks.check_tensors(self.measured, depth=one)
+
+    @property
+    def measurement(self) -> SparseDepth:
+        """Depth to hold generated depth against."""
+        return SparseDepth(self.depth, self.valid) if self.measured is None else self.measured
 
     def to(self, device: torch.device) -> Condition:
         """The same condition with its tensors on a device."""
         renders = None if self.renders is None else self.renders.to(device)
-        return replace(self, **_moved(self, device), renders=renders)
+        measured = None if self.measured is None else self.measured.map(lambda x: x.to(device))
+        return replace(self, **_moved(self, device), renders=renders, measured=measured)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -476,6 +502,7 @@ class Clip:
         shift_m: lateral shift from the recorded path, metres, positive to the left.
         point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
         fine: a rectangle at a higher resolution, or None.
+        depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None: wholly.
     """
 
     condition: Condition
@@ -486,12 +513,19 @@ class Clip:
     shift_m: float = 0.0
     point_color: Tensor | None = None
     fine: FinePatch | None = None
+    depth_confidence: Tensor | None = None
 
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
         one = (t, 1, h, w)
         checks.check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
-        checks.check_given_tensors(self, point_color=(t, 3, h, w))
+        checks.check_given_tensors(self, point_color=(t, 3, h, w), depth_confidence=one)
+
+    @property
+    def depth_weight(self) -> Tensor:
+        """What depth counts in a loss, f32[T, 1, H, W]: its confidence, 0 where it is not valid."""
+        known = self.depth_valid.float()
+        return known if self.depth_confidence is None else known * self.depth_confidence
 
     def to(self, device: torch.device) -> Clip:
         """The same clip with its tensors on a device."""

@@ -224,22 +224,28 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
     return functional.interpolate(value, scale_factor=float(factor)).clamp(0.0, 1.0)
 
 
-def depth_agreement(depth: Tensor, condition: Condition) -> Tensor:
+def depth_agreement(depth: Tensor, condition: Condition, slack_px: int = 0) -> Tensor:
     """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1].
 
     exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within 2 pixels as the mean of
     those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
     be trusted either.
+
+    Args:
+        slack_px: a measurement agrees with every depth between the least and the greatest of the pixels so near. For measurements of
+            a finer grid than the image's, which lie anywhere in a pixel: near the horizon, and at edges, depth changes within one.
     """
     pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)  # noqa: E731
-    found = torch.empty_like(depth)
-    for number, (made, measured, valid) in enumerate(zip(depth, condition.depth, condition.valid, strict=True)):
+    top = lambda x: functional.max_pool2d(x, 2 * slack_px + 1, stride=1, padding=slack_px)  # noqa: E731
+    points, agreement = condition.measurement, torch.empty_like(depth)
+    for number, (made, measured, valid) in enumerate(zip(depth, points.depth, points.valid, strict=True)):
         seen = valid.float()  # one frame at a time: they may be large
-        ratio = (made.clamp(min=0.1) / measured.clamp(min=0.1)).log().abs()
+        made, measured = made.clamp(min=0.1), measured.clamp(min=0.1)
+        ratio = torch.maximum((-top(-made) / measured).log(), -(top(made) / measured).log()).clamp(min=0)
         agrees = torch.exp(-5.0 * ratio).clamp(min=0.2)
         near = pool(seen)
-        found[number] = torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
-    return found
+        agreement[number] = torch.where(near > 0, pool(agrees * seen) / near.clamp(min=1e-6), torch.ones_like(near))
+    return agreement
 
 
 def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:
@@ -247,4 +253,5 @@ def settle_depth(depth: Tensor, condition: Condition, far_m: float) -> Tensor:
 
     The condition's points have passed a visibility test, so they are taken as they are.
     """
-    return torch.where(condition.valid, condition.depth, depth).clamp(max=far_m)
+    points = condition.measurement
+    return torch.where(points.valid, points.depth, depth).clamp(max=far_m)

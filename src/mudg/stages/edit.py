@@ -20,7 +20,7 @@ from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.scene import SCENE_FILES, read_scene
 from mudg.stages.config import EditConfig
 from mudg.stages.editing.carried import EditedDrive, carry_out, read_and_digest
-from mudg.stages.editing.harmonised import repairing
+from mudg.stages.editing.harmonised import check_paths, repairing
 from mudg.stages.editing.runs import RunParts, find_run
 from mudg.stages.editing.weathered import conditions_of
 from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_scene
@@ -67,6 +67,8 @@ def run(
     if config.harmonize.on and not parts.whole:
         raise UsageError("a fit by itself has no images to repair", where="--harmonize.on",
             remedy="edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`")  # fmt: skip
+    if config.harmonize.on and loaded is not None:
+        check_paths(config.harmonize, {name: len(loaded.frames_of(name)) for name in loaded.cameras if loaded.frames_of(name)})
     made = drive.model(model, keep_ego=not parts.whole)
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:

@@ -464,8 +464,8 @@ def virtual_terms(
     if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
         loss = losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
         terms["virtual_lidar"] = weights.lidar_weight * loss
-    if view.sky is not None and config.loss.sky_weight and state.model.sky is not None:
-        terms["virtual_sky"] = config.loss.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, view.sky), weight)
+    if view.sky is not None and weights.sky_weight and state.model.sky is not None:
+        terms["virtual_sky"] = weights.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, view.sky), weight)
     if render.extra is not None and view.channels is not None and weights.semantic_weight:
         total, lift = weight[0].numel() / weights.semantic_weight, sky_lift(state.model, render.alpha)
         terms["virtual_semantics"] = native_ops.class_loss(render.extra, view.channels, weight[0], total, lift)

@@ -333,7 +333,8 @@ def _train_network(
 
 def _loss_settings(config: LearnConfig, class_weights: Tensor) -> LossSettings:
     data = config.data
-    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout, data.effect_dropout)
+    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout, data.effect_dropout,
+                        frame_dropout=data.reference_dropout_scope == "tokens_and_frame")  # fmt: skip
 
 
 def _watch_missed(

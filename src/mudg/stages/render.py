@@ -39,7 +39,7 @@ from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
 from mudg.stages.editing.carried import FACT, EditedDrive, carry_out, read_and_digest
-from mudg.stages.editing.harmonised import EditedSources, Harmoniser, RepairedViews
+from mudg.stages.editing.harmonised import EditedSources, Harmoniser, RepairedViews, check_paths
 from mudg.stages.editing.harmonised_weather import WeatherHarmoniser, harmonises_weather
 from mudg.stages.editing.weathered import Drawer, conditions_of, in_weather, weather_of
 from mudg.stages.fit import load_model, render_view
@@ -89,6 +89,8 @@ def run(
     device = choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
     asked = fused if config.harmonize.on else None
     edited = None if script is None else _edited(scene, model, script, asked)  # what cannot be done is told before anything is written
+    if edited is not None and config.harmonize.on:
+        check_paths(config.harmonize, {path.name: len(path) for path in trajectories(edited[0], config)})
     folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()

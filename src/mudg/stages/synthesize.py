@@ -91,7 +91,8 @@ def run(
         config: see `SynthesizeConfig`.
         scene: scene directory or stored zip. fused: output of fuse for this scene.
         out: a finished result of the same configuration and inputs is verified and reused.
-        fitted: output of fit for this scene, whose renders become part of the condition. For models that were trained with renders.
+        fitted: output of fit for this scene, whose renders become part of the condition. For models that were trained with renders, and
+            for the weather and light of `edits`.
         edits: an edit script; views are made of the drive as it says.
 
     Raises:
@@ -102,7 +103,8 @@ def run(
         script, asked["edits"] = read_and_digest(Path(edits))
         named = {f"{edits}: {name}": path for name, path in script.files().items()}
     refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "edits": edits, "model": folder_of(config.model), **named})
-    config = loading.check_config(config, fitted is not None)
+    weather = script is not None and shows_weather(config, script, fitted is not None)
+    config = loading.check_config(config, fitted is not None, weather=weather)
     inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model), **asked}
     loaded = read_scene(scene)
     if fitted is not None:
@@ -168,9 +170,10 @@ def _edited(config: SynthesizeConfig, script: EditScript, given: tuple[Scene, Pa
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
-    """Whether views are generated in the weather and light of a script: from renders of a fit, by a model that takes an effect vector."""
+    """Whether views are generated in the weather and light of a script: from renders of a fit, by a model that takes an effect vector,
+    or by a published-type one from points and a reference in that weather."""
     wanted = effect_vector(editing_weather.conditions_of(script.canonical())) is not None and fitted and config.condition == "full"
-    return wanted and not is_published(config.model) and takes_effects(config.model)
+    return wanted and (is_published(config.model) or takes_effects(config.model))
 
 
 def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
@@ -434,7 +437,7 @@ class ViewMaker:
 
 def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedClip:
     """The clip with NaN for the depth of what is classed as sky and was not measured."""
-    sky = (clip.semantics == SKY).unsqueeze(1) & ~condition.valid
+    sky = (clip.semantics == SKY).unsqueeze(1) & ~condition.measurement.valid
     return replace(clip, depth=torch.where(sky, torch.nan, clip.depth))
 
 

@@ -18,7 +18,7 @@ from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition
 from mudg.data.clips.vacated import VacatedAt
-from mudg.data.clips.weathered import InWeather, weathered
+from mudg.data.clips.weathered import InWeather, WeatheredPoints, weathered
 
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
@@ -61,8 +61,10 @@ def conditions_of(
         condition = near_condition(sources.near, views, rules)
         return condition, condition
     if parts == "full":
-        small, fine = build_conditions(cloud, tracks, views, recorded, rules, kept, sources.render_at, sources.vacated_at)
-        return (small, fine) if sources.weather is None else in_weather(small, fine, sources.weather)
+        how, render_at = sources.weather, sources.render_at
+        recolor = WeatheredPoints(how, render_at) if rules.published and how is not None and render_at is not None else None
+        small, fine = build_conditions(cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor)
+        return (small, fine) if how is None or rules.published else in_weather(small, fine, how)
     if parts == "repair":
         return _of_renders(sources, views, kept)
     points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -34,8 +34,8 @@ from torch.nn import functional
 from mudg.base import geometry, palette, scratch
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
-from mudg.base.types import Condition, FusedCloud, Photo, Track, View
-from mudg.core.pictures import resize_area
+from mudg.base.types import Condition, FusedCloud, Photo, SparseDepth, Track, View
+from mudg.core.pictures import resize_area, to_bytes
 from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import seen_pixels
@@ -86,7 +86,8 @@ class ConditionRules:
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
     With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour by
-    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in.
+    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes beside it
+    (`Condition.measured`).
     """
 
 
@@ -112,6 +113,18 @@ LEAST_FALL = 0.02
 """Metres per metre of depth by which a ray must fall to be followed to the ground."""
 RenderAt = Callable[[View], RenderPlanes]
 """What a fitted scene shows at a view, without the leading dimension."""
+
+
+class Recolor(Protocol):
+    """Another weather or light for what the published system is given."""
+
+    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of the valid pixels of projected points."""
+        ...
+
+    def photo(self, view: View, rgb: Tensor) -> Tensor:
+        """A recorded image f32[3,H,W]."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +224,14 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
     return nearest[0], nearest[1]
 
 
+def filled_depth(measured: SparseDepth, far_m: float = 100.0) -> Tensor:
+    """Depth f32[T,1,H,W] with the nearest measured pixel's where nothing was measured; `far_m` in a frame without any."""
+    filled = []
+    for image, valid in zip(measured.depth[:, 0].numpy(), measured.valid[:, 0].numpy(), strict=True):
+        filled.append(torch.from_numpy(image[nearest_valid(valid)] if valid.any() else np.full_like(image, far_m)))
+    return torch.stack(filled)[:, None]
+
+
 def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
     """Where the pixels of `view`, at `depth` f32[K,H,W] metres, lie in another view.
 
@@ -300,6 +321,8 @@ def build_conditions(
     sources: dict[int, WarpSource] | None = None,
     render_at: RenderAt | None = None,
     vacated_at: VacatedAt | None = None,
+    *,
+    recolor: Recolor | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
 
@@ -311,6 +334,7 @@ def build_conditions(
         render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
             (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
         vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
+        recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
 
     Returns:
         Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
@@ -323,9 +347,9 @@ def build_conditions(
     if not views:
         raise InputError("a condition needs at least one view", where="clips.build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
-    reference = _reference(small[0], recorded, rules)
+    reference = _reference(small[0], recorded, rules, recolor)
     if rules.published:
-        condition = _published_condition(cloud, tracks, small, reference, rules)
+        condition = _published_condition(cloud, tracks, small, reference, rules, recolor)
         return condition, condition
     sources = {} if sources is None else sources
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
@@ -475,23 +499,38 @@ def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Ten
 
 
 def _published_condition(
-    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules
-) -> Condition:
+    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules,
+    recolor: Recolor | None,
+) -> Condition:  # fmt: skip
     own = (rules.width, rules.height)
     native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     seen = views if native == own else [view.resized(*native) for view in views]
     sparse = [project_sparse(cloud, tracks, view, rules) for view in seen]
     valid = torch.stack([s.valid for s in sparse])[:, None]
-    color = torch.stack([s.rgb for s in sparse]) * valid
+    colors = [s.rgb if recolor is None else recolor.points(view, s) for view, s in zip(seen, sparse, strict=True)]
+    color = torch.stack(colors) * valid
     depth = torch.stack([s.depth for s in sparse])[:, None] * valid
     if native != own:
         color = functional.interpolate(color, size=own[::-1], mode="nearest")
         depth = functional.interpolate(depth, size=own[::-1], mode="bilinear", align_corners=False)
         valid = (color > 0).any(1, keepdim=True) | (depth > 0)
-    return Condition(tuple(views), color, depth, valid, reference)
+    return Condition(tuple(views), color, depth, valid, reference, measured=_measured(cloud, tracks, views, rules))
 
 
-def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> Tensor:
+def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], rules: ConditionRules) -> SparseDepth:
+    """What visible points measure at views of the condition's size.
+
+    Points are drawn on a grid at least as fine as the camera's and the condition's, without those that others hide, and each pixel
+    takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is not preferred.
+    """
+    own, seen = (rules.width, rules.height), replace(rules, published=False)
+    grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
+    points = [project_sparse(cloud, tracks, view if grid == own else view.resized(*grid), seen) for view in views]
+    whole = SparseDepth(*(torch.stack([getattr(p, name) for p in points])[:, None] for name in ("depth", "valid")))
+    return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
+
+
+def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, recolor: Recolor | None) -> Tensor:
     own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
     if not own:
         return torch.zeros(3, rules.height, rules.width)
@@ -499,6 +538,8 @@ def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules) -> 
     rgb = nearest.rgb
     if nearest.usable is not None and not nearest.usable.all():
         rgb = rgb[nearest_valid(nearest.usable)]
+    if recolor is not None:
+        rgb = to_bytes(recolor.photo(nearest.view, image_tensor(rgb)))
     if rules.published and rules.fine_width:
         size = (rules.height, rules.width)
         return functional.interpolate(image_tensor(rgb)[None], size=size, mode="bilinear", align_corners=False)[0]

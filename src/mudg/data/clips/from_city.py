@@ -33,7 +33,7 @@ from mudg.data.clips import varied, weathered
 from mudg.data.clips.city_log import CityLog, record_with_faults
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition, simulated_lateness_s
-from mudg.data.clips.shards import pack_clips, shard_path, write_shard
+from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 
 HELD_OUT = 1_000_000
 """Numbers of cities, and of clips of logs, from here on are for scoring, never for training. Such cities have the standard
@@ -316,11 +316,12 @@ def shifted_view(world: CityWorld, view: View, shift_m: float) -> View:
 
 
 def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
-    """A clip from a condition and the generator's truth at its views; the sky has no valid depth."""
+    """A clip from a condition and the generator's truth at its views; the sky is known to be far away."""
     rgb = torch.stack([torch.from_numpy(np.ascontiguousarray(t.rgb)).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(np.ascontiguousarray(t.depth))[None] for t in truths])
     ids = torch.stack([torch.from_numpy(t.semantics.astype(np.int64)) for t in truths])
-    return Clip(condition, rgb.float(), depth, torch.isfinite(depth), ids)
+    sky = ~torch.isfinite(depth)
+    return Clip(condition, rgb.float(), torch.where(sky, FAR_M, depth), torch.ones_like(sky), ids)
 
 
 def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path, fit: FitCity | None = None) -> None:

@@ -2,8 +2,8 @@
 
 A clip is a window of consecutive frames of one camera, seen from where they were recorded:
 
-* **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured (and the depth labels of
-  the scene, where there are such); classes where labels exist and are trusted;
+* **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured, and elsewhere the depth labels of
+  the scene, where there are such, with their confidence; classes where labels exist and are trusted;
 * **condition**: what `synthesize` would build for these views without their own images. Every view gets only images that
   are at least some moments away, so that the model has to complete something: between one and `farthest` moments, drawn per
   window. A random share of the cloud's points is left out, so that depth is more than copying.
@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -38,13 +39,14 @@ from mudg.data.clips.condition import (
     ConditionRules,
     WarpSource,
     build_conditions,
+    filled_depth,
     image_tensor,
-    nearest_valid,
 )
 from mudg.data.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import photographs, read_image, read_label, read_points, read_scene, read_trusted_classes
 
+DepthTruth = Literal["annotated", "sweep"]
 INDEX = "log_clips.json"
 SKY = palette.ID["sky"]
 
@@ -68,6 +70,8 @@ class LogClipRules:
     """Nearest usable image of a view: up to so many moments away (held-out windows: always 2, or this if less)."""
     least_points: float = 0.3
     """Smallest share of the cloud's points that a training window keeps."""
+    depth: DepthTruth = "annotated"
+    """What is learned as depth: the sweep taken with an image alone, or the scene's depth labels too."""
     label_confidence: float = 0.5
     """Labels with less confidence than this are no truth."""
     fine: int = 2
@@ -172,17 +176,20 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     rules = log.rules
     rng = seeds.numpy_rng(rules.seed, number, "log clip")
     gap = min(2, rules.farthest) if window.held_out else int(rng.integers(1, rules.farthest + 1))
-    cloud = log.cloud if window.held_out else thinned_cloud(log.cloud, rng.uniform(rules.least_points, 1.0), rng)
+    share = 1.0 if window.held_out else rng.uniform(rules.least_points, 1.0)
+    cloud = log.cloud if share == 1.0 else thinned_cloud(log.cloud, share, rng)
     places = [log.place[name] for name in window.frames]
     build = _published_condition if rules.published else _condition
     condition, images = build(log, cloud, places, gap)
     truths = [
-        _truth(log.scene, log.frame(name), images[place], view)
+        _truth(log, log.frame(name), images[place], view)
         for name, place, view in zip(window.frames, places, condition.views)
     ]
-    rgb, depth, known, ids = (torch.stack(column) for column in zip(*truths))
-    depth = torch.where(known, depth, _nearest_depth(condition.depth))  # a plausible filling: the noisy input shows it
-    return Clip(condition, rgb, depth, known, ids)
+    rgb, depth, confidence, ids = (torch.stack(column) for column in zip(*truths))
+    known = confidence > 0
+    given = condition.depth if condition.measured is None else filled_depth(condition.measured)
+    depth = torch.where(known, depth, given)  # a plausible filling: the noisy input shows it
+    return Clip(condition, rgb, depth, known, ids, depth_confidence=None if bool((confidence[known] == 1).all()) else confidence)
 
 
 def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int) -> tuple[Condition, dict[int, Photo]]:
@@ -215,15 +222,6 @@ def _published_condition(
     return build_conditions(cloud, log.scene.tracks, views, [images[places[0]]], conditions)[0], images
 
 
-def _nearest_depth(depth: Tensor, far_m: float = ConditionRules(1, 1).far_m) -> Tensor:
-    """Depth f32[T,1,H,W] with its zeros replaced by the nearest pixel's that has some; `far_m` in a frame without any."""
-    filled = []
-    for image in depth[:, 0].numpy():
-        rows, columns = nearest_valid(image > 0)
-        filled.append(torch.from_numpy(image[rows, columns] if (image > 0).any() else np.full_like(image, far_m)))
-    return torch.stack(filled)[:, None]
-
-
 def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> FusedCloud:
     """A random `share` of the points of every cloud."""
 
@@ -248,22 +246,26 @@ def _stacked(parts: Sequence[Condition]) -> Condition:
     return Condition(views, color, depth, valid, parts[0].reference, **optional)
 
 
-def _truth(scene: Scene, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """rgb f32[3,H,W], depth f32[1,H,W] metres, where it is known bool[1,H,W], classes i64[H,W], all at the size of `view`."""
-    width, height = view.camera.width, view.camera.height
+def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """rgb f32[3,H,W], depth f32[1,H,W] metres, its confidence f32[1,H,W] (1 = measured, 0 = unknown) and classes i64[H,W], all at the
+    size of `view`. Where classes or labels say sky, depth is far away."""
+    scene, (width, height) = log.scene, (view.camera.width, view.camera.height)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
     ids = np.full((height, width), palette.UNLABELLED, np.uint8)
     if recorded.semantics is not None:
         ids = resize_nearest(recorded.semantics, height, width)
     depth, known = measured_depth(scene, view)
-    if "depth" in frame.labels and "depth_confidence" not in frame.labels:  # else a labeller guessed it
-        labelled = resize_nearest(read_label(scene, frame, "depth"), height, width)
-        depth = np.where(~known & np.isfinite(labelled), labelled, depth)
-        known = known | np.isfinite(labelled)
-    sky = (ids == SKY) & ~known
-    depth, known = np.where(sky, np.float32(FAR_M), depth), known | sky
-    image = torch.from_numpy(depth.astype(np.float32))[None]
-    return rgb, image, torch.from_numpy(known)[None], torch.from_numpy(ids.astype(np.int64))
+    confidence, sky = known.astype(np.float32), (ids == SKY) & ~known
+    if log.rules.depth == "annotated" and "depth" in frame.labels:
+        label = lambda name: resize_nearest(read_label(scene, frame, name), height, width)  # noqa: E731
+        labelled, sure = label("depth"), label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)
+        more = ~known & ~sky & np.isfinite(labelled) & ~(label("ego") if "ego" in frame.labels else np.False_)
+        depth, confidence = np.where(more, labelled, depth), np.where(more, sure, confidence)
+        if "sky" in frame.labels:  # made labels have a depth there, too
+            depth = np.where(more & label("sky"), np.float32(FAR_M), depth)
+    depth, confidence = np.where(sky, np.float32(FAR_M), depth), np.where(sky, np.float32(1), confidence)
+    planes = (torch.from_numpy(x.astype(np.float32))[None] for x in (depth, confidence))
+    return rgb, *planes, torch.from_numpy(ids.astype(np.int64))
 
 
 def measured_depth(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -17,6 +17,10 @@ and, where a fitted scene was rendered,
 
 and, of clips in other weather or light, effect f32[K,8] (`base.effects`)
 
+and, of recorded logs with annotated depth, depth_confidence u8[K,T,H,W] (of 255)
+
+and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0 = nothing
+
 and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column, scale).
 """
 
@@ -37,7 +41,7 @@ from mudg.base import seeds, store
 from mudg.base.effects import EFFECTS
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
-from mudg.base.types import Camera, Clip, Condition, FinePatch, View
+from mudg.base.types import Camera, Clip, Condition, FinePatch, SparseDepth, View
 
 Result = TypeVar("Result")
 FAR_M = 1000.0
@@ -109,6 +113,11 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
     if any(c.effect is not None for c in conditions):
         nothing = torch.zeros(len(EFFECTS))
         arrays["effect"] = np.stack([(nothing if c.effect is None else c.effect).numpy() for c in conditions])
+    measured = [c.measured for c in conditions if c.measured is not None]
+    if measured and len(measured) == len(clips):
+        arrays["measured"] = np.stack([f16(m.depth) * m.valid[:, 0].numpy() for m in measured])
+    if any(c.depth_confidence is not None for c in clips):
+        arrays["depth_confidence"] = np.stack([u8(c.depth_weight)[:, 0] for c in clips])
     patches = [clip.fine for clip in clips if clip.fine is not None]
     if patches and len(patches) == len(clips):
         fine = pack_clips([patch.clip for patch in patches], gaps=gaps)
@@ -200,7 +209,7 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
     names = [
         *_PER_FRAME,
-        *(("point_color",) if f"{prefix}point_color" in there else ()),
+        *(name for name in ("point_color", "measured", "depth_confidence") if prefix + name in there),
         *(_RENDERS if rendered else ()),
     ]
     found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
@@ -219,14 +228,17 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
             image(found["render"]), plane(found["render_depth"]), plane(found["alpha"]) / 255, plane(found["certainty"]) / 255,
             found["render_ids"].unsqueeze(1),
         )  # fmt: skip
+    measured = plane(found["measured"]) if "measured" in found else None
     condition = Condition(
         views, image(found["color"]), plane(found["sparse_depth"]), (flags & FLAG_VALID) > 0, image(reference),
         warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
         backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders, effect=_effect_in(shard, f"{prefix}effect", clip),
+        measured=None if measured is None else SparseDepth(measured, measured > 0),
     )  # fmt: skip
     return Clip(
         condition, image(found["rgb"]), plane(found["depth"]), (flags & FLAG_DEPTH_UNKNOWN) == 0, found["semantics"].long(), shift_m,
         image(found["point_color"]) if "point_color" in found else None,
+        depth_confidence=plane(found["depth_confidence"]) / 255 if "depth_confidence" in found else None,
     )  # fmt: skip
 
 
@@ -291,8 +303,11 @@ def _mirrored(clip: Clip) -> Clip:
     names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
     turned = {name: flip(getattr(given, name)) for name in names}
     renders = None if given.renders is None else given.renders.map(flip)
+    measured = None if given.measured is None else given.measured.map(flip)
     own = {name: flip(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
-    return replace(clip, condition=replace(given, **turned, renders=renders), **own, shift_m=-clip.shift_m)
+    if clip.depth_confidence is not None:
+        own["depth_confidence"] = flip(clip.depth_confidence)
+    return replace(clip, condition=replace(given, **turned, renders=renders, measured=measured), **own, shift_m=-clip.shift_m)
 
 
 NO_IDS, WORSE_IDS = 0.35, 0.25

@@ -1,7 +1,8 @@
 """Conditions in other weather or light, and exact pairs for learning what the edit of colours leaves wrong.
 
 A condition is edited as views are (`core.weather`): the colours of what was seen, of the backdrop and of the renders, each with its own
-depth and classes; then it says so in its effect vector. Its geometry and classes stay.
+depth and classes; then it says so in its effect vector. Its geometry and classes stay. What the published system is given, points and a
+reference image, is edited before it is brought to the network's size (`WeatheredPoints`).
 
 `pairs_of` makes training clips: the condition of a clear day, edited so, and the same city generated in that weather. Rain and snow that
 fall, and the vehicle's headlights, are put into the generated image by the formulas of the edit, but from exact depth, normals, albedo,
@@ -30,7 +31,7 @@ from mudg.core.weather.tone import SRGB
 from mudg.data.city import CityConfig, CityTruth, CityWorld
 from mudg.data.city.weather import city_light
 from mudg.data.city.world import CitySurfaces
-from mudg.data.clips.condition import RenderAt
+from mudg.data.clips.condition import ProjectedPoints, RenderAt
 
 SKY: Final = palette.ID["sky"]
 BACKDROP_M: Final = 80.0
@@ -56,6 +57,26 @@ class InWeather:
         shown = ShownView(view, rgb.permute(1, 2, 0).numpy(), metres, ids[0].numpy())
         made, _ = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
         return torch.from_numpy(np.ascontiguousarray(made.transpose(2, 0, 1), np.float32)).clamp(0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class WeatheredPoints:
+    """Points and recorded images of a drive in weather, with the surfaces of a fitted scene between the points and behind the images."""
+
+    how: InWeather
+    render_at: RenderAt
+
+    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of projected points in this weather, each at its own distance; meaningless where there are none."""
+        shown = self.render_at(view)
+        ids = torch.where(seen.valid & (shown.semantics == SKY), palette.UNLABELLED, shown.semantics)
+        depth = torch.where(seen.valid, seen.depth, shown.depth)
+        return self.how.image(view, torch.where(seen.valid, seen.rgb, shown.color), depth, ids.to(torch.uint8))
+
+    def photo(self, view: View, rgb: Tensor) -> Tensor:
+        """A recorded image f32[3,H,W] in this weather."""
+        shown = self.render_at(view)
+        return self.how.image(view, rgb, shown.depth, shown.semantics)
 
 
 def weathered(condition: Condition, how: InWeather) -> Condition:

@@ -110,12 +110,14 @@ class LossSettings:
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
     effect_dropout     share of the clips that go without their effect vector; the small kind
+    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the published kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
     effect_dropout: float = 0.0
+    frame_dropout: bool = False
 
 
 @dataclass(frozen=True)
@@ -338,10 +340,10 @@ class MDM(nn.Module):
 
     def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
         """What the refiner should give for clips or patches of one size."""
-        rgb, depth, valid, ids = (
-            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        rgb, depth, weight, ids = (
+            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
         )
-        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, valid.float())
+        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, weight)
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
         """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""

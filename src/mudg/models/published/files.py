@@ -25,6 +25,16 @@ def is_published(path: Path | str) -> bool:
     return isinstance(content, dict) and content.get("kind") == KIND
 
 
+def window_of(path: Path | str) -> int:
+    """Frames of a clip of the model in a folder, from its description alone.
+
+    Raises:
+        InputError: not such a folder.
+    """
+    content, where = read_description(Path(path)), str(Path(path) / MODEL_FILE)
+    return records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config").window
+
+
 def save(
     folder: Path,
     config: PublishedConfig,

@@ -58,6 +58,9 @@ GUIDANCE = 7.5
 GUIDANCE_RESCALE = 0.7
 """Share of the guided velocity whose spread is pulled back to that of the conditional one."""
 
+MEASURED_SLACK_PX = 1
+"""Points are measured on a finer grid than the network's."""
+
 SCALE_ENTRIES = 1400
 """Length of the published table of the dynamic rescale; one entry per noise step is used, the rest repeats the last."""
 
@@ -114,13 +117,15 @@ class PublishedLatents:
     """A batch of conditions as the network wants them.
 
     planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for the reference and
-    grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell that was seen.
+    grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell that was seen; first
+    f32[B,4,h,w] colour of frame 0 as the points show it, without the reference, or None.
     """
 
     planes: Tensor
     features: Tensor
     grey: Tensor
     seen: Tensor
+    first: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -230,6 +235,8 @@ class PublishedMDM(nn.Module):
         condition: Condition | Sequence[Condition],
         generator: torch.Generator | None = None,
         known: Tensor | None = None,
+        *,
+        points_first: bool = False,
     ) -> PublishedLatents:
         """Latents of the conditions of clips of one shape, and image features of their references (see `PublishedLatents`).
 
@@ -237,6 +244,7 @@ class PublishedMDM(nn.Module):
             generator: noise of the autoencoder's posterior; needed unless the configuration names its mean.
             known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
                 colour there (of every clip), frame 0 excepted.
+            points_first: also encode frame 0 without the reference (`PublishedLatents.first`).
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
         color, depth, valid, reference = (
@@ -251,14 +259,15 @@ class PublishedMDM(nn.Module):
         if known is not None:
             color = torch.cat([known.to(color).expand(len(color), -1, -1, -1, -1), color[:, len(known) :]], 1)
             seen = torch.cat([torch.ones_like(seen[:, : len(known)]), seen[:, len(known) :]], 1)
-        color = torch.cat([reference[:, None], color[:, 1:]], 1)
+        color, bare = torch.cat([reference[:, None], color[:, 1:]], 1), color[:, :1]
         seen = torch.cat([torch.ones_like(seen[:, :1]), seen[:, 1:]], 1)
         generator = self._posterior(generator)
         planes = torch.cat(
             [self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2
         )
         features = self._features(torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])]))
-        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
+        first = self._encode(bare * 2 - 1, generator)[:, 0] if points_first else None
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen), first)
 
     def _features(self, images: Tensor) -> Tensor:
         """What the image tower, which lies on the CPU if `split` says so, makes of images on the model's device."""
@@ -331,17 +340,18 @@ class PublishedMDM(nn.Module):
                         where=f"step {part.step}", expected="points alone, as the published-type model is given",
                         remedy="give another folder of clips; they are made anew")  # fmt: skip
                 draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
-                encoded.append(self.encode_condition(clip.condition, draws))
+                encoded.append(self.encode_condition(clip.condition, draws, points_first=settings.frame_dropout))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
             known: dict[Modality, Tensor] = {
-                "depth": self._share_of_cells(torch.stack([clip.depth_valid for clip in clips])),
+                "depth": self._share_of_cells(torch.stack([clip.depth_weight for clip in clips])),
                 "semantics": self._share_of_cells(classes),
             }
         planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
+        first = torch.cat([e.first for e in encoded]) if settings.frame_dropout else None  # type: ignore[misc]
         return self.velocity_loss(
-            truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
+            truth, PublishedLatents(planes, features, encoded[0].grey, seen, first), seeds.torch_generator(part.seed, part.step, "noise"),
             dropout=ContextDropout.for_reference(settings.reference_dropout), known=known, first=part.first, batch_clips=part.count,
         )  # fmt: skip
 
@@ -367,6 +377,8 @@ class PublishedMDM(nn.Module):
 
         Args:
             truth: latents of `encode_truth`, each [B,T,4,h,w].
+            encoded: with `first`, a clip whose reference is left out has frame 0 without it too; else the image tokens alone go grey,
+                as in the released code.
             generator: of all draws: modality, noise step, noise, which context is left out, dropout inside the network.
             known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere.
             first: number of the first of these clips in the batch of a training step.
@@ -390,9 +402,13 @@ class PublishedMDM(nn.Module):
         no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
+        planes, colors = encoded.planes, x0.shape[2]
+        if encoded.first is not None:
+            bare = torch.cat([encoded.first[:, None], planes[:, 1:, :colors]], 1)
+            planes = torch.where(no_reference.view(-1, 1, 1, 1, 1), torch.cat([bare, planes[:, :, colors:]], 2), planes)
         self._seed_dropout(seed, range(first, first + count))
         stated = self.predict(
-            self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
+            self.schedule.add_noise(x0, eps, t), planes, t, names, text, self.image_tokens(features)
         )
         squares = (stated - self.schedule.velocity(x0, eps, t)).square()
         if known:
@@ -471,8 +487,9 @@ class PublishedMDM(nn.Module):
         confidence = confidence_of(encoded.seen[0], change, self.codec.factor)
         depth, fits = decoded.depth, list[DepthFit]()
         if request.align:
-            depth, fits = align_depth(depth, condition.depth, condition.valid)
-            confidence = confidence * depth_agreement(depth, condition)
+            points = condition.measurement
+            depth, fits = align_depth(depth, points.depth, points.valid)
+            confidence = confidence * depth_agreement(depth, condition, MEASURED_SLACK_PX)
         return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
 
     def _denoise(

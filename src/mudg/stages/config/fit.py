@@ -122,7 +122,7 @@ class RecordedLossConfig:
     lidar_weight: float = Field(default=0.1, ge=0)
     """Weight of LiDAR depth (relative error; the worst 5 % of the points are ignored)."""
     sky_weight: float = Field(default=0.05, ge=0)
-    """Weight of the term that keeps the sky free of Gaussians, on recorded and virtual views."""
+    """Weight of the term that keeps the sky free of Gaussians, on recorded views."""
     semantic_weight: float = Field(default=0.1, ge=0)
     """Weight of semantic classes (cross-entropy)."""
     semantic_every: int = Field(default=3, ge=1)
@@ -177,6 +177,8 @@ class VirtualConfig:
     """Weight of the generated dense depth (robust relative error)."""
     lidar_weight: float = Field(default=0.2, ge=0)
     """Weight of the fused LiDAR points' depth in virtual views (relative error; the worst 5 % of the points are ignored)."""
+    sky_weight: float = Field(default=0.05, ge=0)
+    """Weight of the term that keeps the generated sky free of Gaussians (published: none)."""
     semantic_weight: float = Field(default=0.02, ge=0)
     """Weight of generated classes (cross-entropy). It is small because Gaussians that learned from recorded frames know classes
     better than the shipped diffusion model."""

@@ -17,9 +17,10 @@ class HarmonizeConfig:
     on: bool = False
     """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
     model: str = "embedded"
-    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn."""
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
+    Published-type models make views from noise: they take strengths of 0 and 1, and paths of at least 16 frames."""
     steps: int = Field(default=2, ge=1, le=1000)
-    """Denoising steps."""
+    """Denoising steps. Use 50 for published-type models."""
     uncovered: float = Field(default=1.0, ge=0, le=1)
     """How far the model may leave the render where something stood before, its shadow included: share of the noise schedule, 0 (it stays)
     to 1."""
@@ -27,7 +28,7 @@ class HarmonizeConfig:
     """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
     weather: float = Field(default=0.0, ge=0, le=1)
     """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it. For models that take
-    an effect vector, unless ``weather_any_model`` is set."""
+    an effect vector, unless ``weather_any_model`` is set, and for published-type models, whose points and reference are edited."""
     weather_any_model: bool = False
     """Let a model that takes no effect vector, as the shipped ones, correct weather and light, too: it repairs the edited render without
     being told which weather it is to have."""
@@ -41,5 +42,5 @@ class HarmonizeConfig:
     """Keep the render where the model shows another object in place of a removed one, or none in place of one that is there."""
     seed: int = 0
     """Seed of the noise."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Number format of the diffusion model, as for synthesize."""

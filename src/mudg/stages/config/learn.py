@@ -33,6 +33,9 @@ class LearnData:
     reference_dropout: float = Field(default=0.2, ge=0, le=1)
     """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released code:
     0.1)."""
+    reference_dropout_scope: Literal["tokens", "tokens_and_frame"] = "tokens"
+    """Published-type models: what such a clip lacks. tokens: the image tokens, as in the released code; frame 0 of the colour condition
+    still shows the reference. tokens_and_frame: frame 0 shows points like all others, too, which the paper's sentence may mean."""
     cities: int = Field(default=240, ge=1)
     """Number of generated cities to train on."""
     skip_cities: int = Field(default=0, ge=0)
@@ -83,7 +86,13 @@ class LearnData:
     held_out_every: int = Field(default=5, ge=0)
     """Logs: every n-th clip is used for scoring only (0 = none)."""
     label_confidence: float = Field(default=0.5, ge=0, le=1)
-    """Logs: labels with a confidence below this, 0 to 1, are not learned."""
+    """Logs: classes with a confidence below this, 0 to 1, are not learned."""
+    depth: Literal["annotated", "sweep"] = "annotated"
+    """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's depth labels,
+    weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
+    least_points: float | None = Field(default=None, gt=0, le=1)
+    """Logs: smallest share of the cloud's points in the condition of a training clip; the share is drawn between this and 1 (not given:
+    0.3; published-type models: 1, all points, as in the paper)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

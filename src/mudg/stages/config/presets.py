@@ -53,7 +53,7 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         "fit.virtual.probability": 0.2, "fit.virtual.beside": False, "fit.virtual.start": 0.1, "fit.virtual.stop": 1.0,
         "fit.virtual.gaussians": 0, "fit.virtual.confidence_power": 0.0, "fit.virtual.color_weight": 0.0,
         "fit.virtual.perceptual_weight": 0.1, "fit.virtual.perception": "lpips", "fit.virtual.depth_weight": 0.1,
-        "fit.virtual.lidar_weight": 0.0, "fit.virtual.semantic_weight": 0.1, "fit.virtual.half_size": 0.0,
+        "fit.virtual.lidar_weight": 0.0, "fit.virtual.sky_weight": 0.0, "fit.virtual.semantic_weight": 0.1, "fit.virtual.half_size": 0.0,
     },
 }  # fmt: skip
 """Preset -> setting -> value; settings that are not named have their defaults."""

@@ -58,9 +58,9 @@ class SynthesizeConfig:
     images. Off: at the size the model works at."""
     held_out_images: bool = False
     """Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere
-    (published-type models on older CUDA devices: float16)."""
+    (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as in the release."""
     device: DeviceName = "auto"
     """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     processes: int = Field(default=0, ge=0)

@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -33,6 +33,7 @@ from mudg.data.clips.condition import ConditionRules
 from mudg.data.clips.vacated import GROUND_IDS, determined
 from mudg.models.diffusion import StartClip
 from mudg.models.mdm.codec import Modality
+from mudg.models.published.files import is_published, window_of
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import SynthesizeConfig
 from mudg.stages.config.harmonize import HarmonizeConfig
@@ -62,6 +63,33 @@ CONTACT_REACH: Final = 0.2
 """The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer what was uncovered."""
 OVERLAP: Final = 2
 """Frames that windows share."""
+PUBLISHED_OVERLAP: Final = 8
+"""The same for published-type models."""
+
+
+def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
+    """How the model of a configuration samples.
+
+    Raises:
+        UsageError: a published-type model is to leave a render part of the way: it makes its clips from noise alone.
+    """
+    strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
+    partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
+    if partial and is_published(config.model):
+        raise UsageError("a published-type model makes views from noise: it cannot stay near a render", where=partial[0].split()[0],
+            expected="0 or 1", got=partial[0].split()[1])  # fmt: skip
+    return SynthesizeConfig(
+        model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
+    )
+
+
+def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:
+    """UsageError for what a published-type model cannot do with paths of so many frames, by name, before anything is written."""
+    settings_of(config, "cpu")
+    short = {name: count for name, count in frames.items() if is_published(config.model) and count < window_of(config.model)}
+    for name, count in short.items():
+        raise UsageError("a path is too short for a published-type model, whose clips have a fixed number of frames", where=name,
+            expected=f"at least {window_of(config.model)} frames", got=str(count), remedy="harmonise with a small model")  # fmt: skip
 
 
 DrawPair = Callable[[View], tuple[Observation, Observation]]
@@ -180,20 +208,18 @@ class Harmoniser:
 
     def __init__(self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto") -> None:
         """``size``: width and height of the views."""
-        settings = SynthesizeConfig(
-            model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
-        )  # fmt: skip
-        self._settings = loading.check_config(settings, fitted=True)
+        self._settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
         self._sources, self._config = sources, config
         model = loading.load_any(self._settings)
-        self.window = model.config.window
+        self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
+        self._overlap = min(overlap, self.window - 1)
         width, height = model.image_size(*size, 0)
-        rules = ConditionRules(width, height, *size, images_per_view=config.images_per_view)
+        rules = ConditionRules(width, height, *size, images_per_view=config.images_per_view, published=model.points_alone)
         given = ConditionSources(
             sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
             vacated_at(sources.plan),
         )  # fmt: skip
-        self._maker = ViewMaker(model, given, self._settings, self._start_at)
+        self._maker = ViewMaker(model, given, self._settings, None if model.points_alone else self._start_at)
         self._parts: list[tuple[Observation, Touched]] = []
 
     def _start_at(self, views: Sequence[View]) -> StartClip:
@@ -207,7 +233,7 @@ class Harmoniser:
         """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits do not touch."""
         done, tail = 0, dict[Modality, Tensor]()
         parts: dict[int, tuple[Observation, Touched]] = {}
-        for number, span in enumerate(windows(len(views), self.window, min(OVERLAP, self.window - 1))):
+        for number, span in enumerate(windows(len(views), self.window, self._overlap)):
             parts = {i: parts[i] if i in parts else self._part(views[i], draw) for i in span}
             if not any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values()):
                 yield from (parts[i][0] for i in span if i >= done)
@@ -234,6 +260,7 @@ class Harmoniser:
         touched = replace(touched, shaded=lit & (self._config.uncovered > 0), objects=objects)
         boxes = boxes_mask(render.view, others(self._sources.plan, render.view.time_s))
         kept = guarded(touched, render, made, boxes) if self._config.keep_classes else touched.any
+        kept = kept & made.mask[0]
         return pasted(render, made, soft_edge(kept.numpy(), self._config.feather_px))
 
 

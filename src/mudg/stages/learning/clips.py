@@ -112,10 +112,15 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
     width, height = sized_to_area(config.data.width * config.data.height, camera.width / camera.height, multiple)
     if points_alone:
         width, height = config.data.width, config.data.height
+    return _log_rules(config, (width, height), config.data.held_out_every, points_alone)
+
+
+def _log_rules(config: LearnConfig, size: tuple[int, int], held_out_every: int, points_alone: bool) -> LogClipRules:
+    data = config.data
+    least_points = (1.0 if points_alone else LogClipRules.least_points) if data.least_points is None else data.least_points
     return LogClipRules(
-        width=width, height=height, window=config.data.window, stride=config.data.stride, frame_step=config.data.frame_step,
-        cameras=config.data.cameras, held_out_every=config.data.held_out_every, label_confidence=config.data.label_confidence,
-        seed=config.seed, published=points_alone,
+        *size, window=data.window, stride=data.stride, frame_step=data.frame_step, cameras=data.cameras, held_out_every=held_out_every,
+        label_confidence=data.label_confidence, seed=config.seed, published=points_alone, depth=data.depth, least_points=least_points,
     )  # fmt: skip
 
 
@@ -161,10 +166,11 @@ def scored_shards(config: LearnConfig, folder: Path | ShardSource) -> list[int]:
 def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
     """A sentence on the training data for the model card."""
     given = "the projected points and the first image" if rules.published else "images taken at other times"
+    elsewhere = ", and from labels elsewhere" if rules.depth == "annotated" else ""
     return (
         f"{config.data.cities} clips of {config.data.window} frames of {len(config.data.scenes)} recorded "
         f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where they were\n"
-        f"recorded, with {given} as condition. Depth was learned where a sweep measured it. The model this\n"
+        f"recorded, with {given} as condition. Depth was learned where a sweep measured it{elsewhere}. The model this\n"
         f"one continues from has training data of its own. `held-out` below means every {config.data.held_out_every}. window of these logs."
     )
 
@@ -203,10 +209,7 @@ def open_streamed(
     data = config.data
     if not points_alone:
         data = replace(data, width=round(data.width / multiple) * multiple, height=round(data.height / multiple) * multiple)
-    rules = LogClipRules(
-        width=data.width, height=data.height, window=data.window, stride=data.stride, frame_step=data.frame_step,
-        cameras=data.cameras, held_out_every=0, label_confidence=data.label_confidence, seed=config.seed, published=points_alone,
-    )  # fmt: skip
+    rules = _log_rules(config, (data.width, data.height), 0, points_alone)
     scenes = read_list(data.scenes[0], data.held_out)
     log.info(f"learn: {data.scenes[0]}: {scenes.summary()}")
     return replace(config, data=data), ListedShards(scenes, cache, rules, data.bad_scenes)

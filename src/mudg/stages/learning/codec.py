@@ -88,7 +88,7 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
     L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes.
     """
     rgb, depth, known, ids = (
-        torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
     )
     with torch.no_grad():
         latents: dict[Modality, Tensor] = {

@@ -23,12 +23,12 @@ FEW_STEPS = 20
 DiffusionModel = MDM | PublishedMDM
 
 
-def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
+def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = False) -> SynthesizeConfig:
     """The configuration with its device chosen, and the number of processes that its model wants; without reading weights of a
     published-type model.
 
     Args:
-        fitted: whether a fitted scene is given too.
+        fitted: whether a fitted scene is given too. weather: and tells the distances by which views are brought into other weather.
 
     Raises:
         UsageError: a setting that does not apply to this kind of model, or to the device. InputError: no such model.
@@ -39,10 +39,12 @@ def check_config(config: SynthesizeConfig, fitted: bool) -> SynthesizeConfig:
         raise UsageError(f"on {device} one process makes all trajectories", where="--processes", expected="0 or 1",
                          got=str(config.processes), remedy="leave it out, or give --device cpu")  # fmt: skip
     config = replace(config, device=str(device))
+    half_of(config)
     published = published_files.is_published(config.model)
     (PublishedMDM if published else MDM).check_request(request_of(config))
-    if published and fitted:
-        raise UsageError("a published-type model does not use a fitted scene", where="--fitted", remedy="leave it out")
+    if published and fitted and not weather:
+        raise UsageError("a published-type model uses a fitted scene for weather and light of --edits only", where="--fitted",
+                         remedy="leave it out")  # fmt: skip
     repairs = config.condition == "repair"
     if repairs and not (fitted or published):
         raise UsageError("this condition is made of renders of a fitted scene", where="--condition", got="repair",

@@ -20,6 +20,7 @@ from mudg.core import metrics
 from mudg.core.flicker import TrueFrame, flicker
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.data.clips import shards as clip_shards
+from mudg.data.clips.condition import filled_depth
 from mudg.models.diffusion import GeneratedClip, SampleRequest, generated
 from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
@@ -86,14 +87,15 @@ def without_classes(clip: Clip) -> Clip:
 def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip and its class confusion i64[19,20]."""
     rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
-    depth = torch.where(clip.depth_valid, clip.depth, clip_shards.FAR_M)  # far depth does not count
+    depth = torch.where(clip.depth_weight == 1, clip.depth, clip_shards.FAR_M)  # far depth does not count, nor does guessed depth
     seen = given.valid if given.warped is None else given.valid | given.warped
     backdrop = given.color if given.backdrop is None else given.backdrop
     frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
     flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
-    nearest = metrics.depth_errors(flat(given.depth), flat(depth), flat(solid))
+    filled = given.depth if given.measured is None else filled_depth(given.measured)
+    nearest = metrics.depth_errors(flat(filled), flat(depth), flat(solid))
     matrix = metrics.confusion(sample.semantics.flatten(0, 1), ids.flatten(0, 1))
     sky = (ids == SKY).unsqueeze(1)
     wrong = (sample.rgb - rgb).abs().mean(1, keepdim=True)
@@ -179,7 +181,7 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
     for clip, sample in pairs:
         t = min(frame, len(sample.confidence) - 1)
         given = clip.condition
-        measured = torch.where(given.valid[t], given.depth[t], 100.0)
+        measured = torch.where(given.measurement.valid[t], given.measurement.depth[t], 100.0)
         cells = [
             *(to_bytes(rgb) for rgb in (given.color[t], sample.rgb[t], clip.rgb[t])),
             *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
