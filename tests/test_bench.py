@@ -62,12 +62,15 @@ def test_reported_and_development_cities_differ():
         assert from_city.city_config(rules, number) == from_city.city_config(replace(rules, seed=7), number)
 
 
-def test_what_reads_no_model_does_not_depend_on_it(tmp_path, monkeypatch):
+def test_what_reads_no_model_takes_none(tmp_path, monkeypatch):
     monkeypatch.setitem(bench.BENCHES, "poses", lambda config, out: ({"cities": []}, "nothing"))
-    out = bench.run("poses", BenchConfig(model=str(tmp_path / "no model here")), tmp_path / "out")
+    out = bench.run("poses", BenchConfig(), tmp_path / "out")
     assert json.loads((out / "run.json").read_text())["inputs"] == {}
-    with pytest.raises(MudgError, match="no model|model"):
-        bench.run("mdm", BenchConfig(model=str(tmp_path / "no model here")), tmp_path / "other")
+    absent = BenchConfig(model=str(tmp_path / "no model here"))
+    with pytest.raises(UsageError, match="does not use this setting"):
+        bench.run("poses", absent, tmp_path / "other")
+    with pytest.raises(MudgError, match="no such file or folder"):
+        bench.run("mdm", absent, tmp_path / "other")
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 FOLDER = Path(__file__).resolve().parents[1] / "bench" / "gpu"
 
@@ -50,15 +52,25 @@ def test_passes_and_clips(script: Callable[..., dict[str, Any]]) -> None:
     rows = script("published_passes", "--batches", "3", "6")["rows"]
     passes = {row["batch"]: row["seconds"] for row in rows if row["what"] == "pass"}
     assert set(passes) == {3, 6} and all(row.get("peak_gb") is None for row in rows)  # not measured on a CPU
-    clips = [row for row in rows if row["what"] == "clip with guidance"]
-    assert [row["steps"] for row in clips] == [50, 20, 8, 4]
-    assert clips[0]["computed seconds"] > 50 * passes[6]
+    decoding_s = [row["seconds"] for row in rows if row["what"] == "decoding 4 frames"][-1]
+    for what, batch in (("clip with guidance", 6), ("clip without guidance", 3)):
+        clips = {row["steps"]: row["computed seconds"] for row in rows if row["what"] == what}
+        assert clips == pytest.approx({steps: steps * passes[batch] + 3 * decoding_s for steps in (50, 20, 8, 4)})
 
 
 @pytest.mark.parametrize("stage", ["1", "2"])
-def test_training_steps(script: Callable[..., dict[str, Any]], stage: str) -> None:
+def test_training_steps(script: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
+    """A stage moves what it is said to move, and nothing else."""
+    training, drawn = importlib.import_module("published_training"), []
+    draw = training.drawn_model
+    monkeypatch.setattr(training, "drawn_model", lambda *given: (drawn.append(draw(*given)), drawn[0])[1])
     (row,) = script("published_training", "--stage", stage)["rows"]
-    assert row["seconds"] > 0 and row["batch"] == 1
+    assert row["what"] == f"training step, stage {stage}" and row["batch"] == 1
+    before = draw(training.SMALL_PUBLISHED, torch.device("cpu"), torch.float32).state_dict()
+    moved = {name for name, value in drawn[0].state_dict().items() if not torch.equal(value, before[name])}
+    assert moved and all(name.startswith(("net.", "image_tokens.")) for name in moved)
+    temporal = {name for name in before if name.startswith("net.") and ".temporal" in name}
+    assert temporal and bool(moved & temporal) == (stage == "1")
 
 
 def test_the_rasterisers_agree(script: Callable[..., dict[str, Any]]) -> None:
@@ -79,14 +91,21 @@ def test_fewer_passes_of_a_stand_in(script: Callable[..., dict[str, Any]], tmp_p
 
 
 @pytest.mark.slow
-def test_training_of_the_small_model(script: Callable[..., dict[str, Any]]) -> None:
+def test_training_of_the_small_model(script: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     result = script("train_mdm")
-    assert set(result["digests"]) == {"shipped", "trained"}
-    assert result["rows"][0]["steps"] == 2
+    shipped = FOLDER.parents[1] / "src" / "mudg" / "assets" / "mdm_small" / "model.json"
+    (trained,) = (tmp_path / "work" / "learned").rglob("model.json")
+    assert result["digests"] == {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in (("shipped", shipped), ("trained", trained))}
+    training, *scores = result["rows"]
+    assert training["steps"] == json.loads(trained.read_text())["facts"]["recipe"]["steps"] == 2
+    for row, path in zip(scores, (shipped, trained), strict=True):
+        assert json.loads(row["held_out"]) == json.loads(path.read_text())["facts"]["held_out"]
 
 
 @pytest.mark.slow
-def test_the_whole_chain(script: Callable[..., dict[str, Any]]) -> None:
-    result = script("city_run")
-    assert {"ingest", "fit with diffusion", "score"} <= {row["what"] for row in result["rows"]}
-    assert len(result["digests"]["metrics"]) == 64
+def test_the_whole_chain(script: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    result, run = script("city_run"), tmp_path / "work" / "run"
+    assert result["digests"]["metrics"] == hashlib.sha256((run / "score" / "metrics.json").read_bytes()).hexdigest()
+    steps = json.loads((run / "run.json").read_text())["steps"]
+    assert {row["what"]: row["seconds"] for row in result["rows"]} == pytest.approx({n: of["seconds"] for n, of in steps.items()})
+    assert {"ingest", "fit with diffusion", "score"} <= set(steps)

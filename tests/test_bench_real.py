@@ -161,10 +161,10 @@ ADAPT = AdaptConfig(block=1, held_out_every=2, fit_iterations=2, steps=1, shifts
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
     rows = tuple(row for row in real.METHOD_ROWS if row.name in ("nearest_fill", "mudg_s"))
-    job = real.SplitJob(
-        out, source, split, (), rows, FitConfig(method="mudg_s", iterations=6, densify={"kind": "none"}),
-        SynthesizeConfig(model=model, steps=1, shifts_m=(2.0,), processes=1), dataclasses.replace(ADAPT, model=model), (), False,
-    )  # fmt: skip
+    config = BenchConfig(
+        model=model, iterations=6, fit=FitConfig(densify={"kind": "none"}), synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,))
+    )
+    job = real.SplitJob(out, source, split, (), rows, config, dataclasses.replace(ADAPT, model=model), False)
     whole = read_scene(source)
     held = real_protocols.held_out(whole, split, ())
     real.write_seen(job, whole, held)
@@ -349,7 +349,7 @@ def exact(city, tmp_path_factory):
         scene, protocol = read_scene(city), PROTOCOLS[name]
         split = SPLITS[protocol.split]
         held = real_protocols.held_out(scene, split, ())
-        job = real.SplitJob(out, city, split, (), (), FitConfig(), SynthesizeConfig(), ADAPT, (), False)
+        job = real.SplitJob(out, city, split, (), (), BenchConfig(), ADAPT, False)
         real.write_seen(job, scene, held)
         cameras = real._asked_cameras(job, scene, held)
         world = CityWorld.from_source(scene.source)
@@ -431,9 +431,10 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     before = [path.stat().st_mtime_ns for path in watched]
     added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
     more = dataclasses.replace(
-        config, methods=added, protocols=("gap-1",), model=model, variant=("rough=densify.kind:none,method:gs3d",)
+        config, methods=added, protocols=("gap-1",), model=model, variant=("rough=densify.kind:none,method:gs3d",),
+        synthesize=SynthesizeConfig(shifts_m=(2.0,)),
     )  # fmt: skip
-    real.run(more, [city], out, virtual_shifts_m=(2.0,))
+    real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
     names = ["street_gaussians", "street_gaussians-longer", "mudg_r-no-adapt", "mudg_s", "mudg_s-no-renders", "rough"]
@@ -462,8 +463,8 @@ def test_a_log_too_short_to_adapt_to_is_compared_without_and_says_so(made, city)
 
 def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_said(city, model, tmp_path, monkeypatch):
     job = real.SplitJob(
-        tmp_path / "out", city, SPLITS["all"], (), (), FitConfig(method="mudg_s", iterations=4), SynthesizeConfig(model=model),
-        dataclasses.replace(ADAPT, model=model), (), False,
+        tmp_path / "out", city, SPLITS["all"], (), (), BenchConfig(model=model, iterations=4), dataclasses.replace(ADAPT, model=model),
+        False,
     )  # fmt: skip
     scene = read_scene(city)
     real.write_seen(job, scene, real_protocols.held_out(scene, SPLITS["all"], ()))
@@ -484,7 +485,7 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
     assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
     plain = str(tmp_path / "plain")
     mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
-    use = real.diffusion_use(dataclasses.replace(job, generator=SynthesizeConfig(model=plain)), "adapted")
+    use = real.diffusion_use(dataclasses.replace(job, config=BenchConfig(model=plain)), "adapted")
     assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
     assert real.diffusion_use(job, "points") == real.DiffusionUse("points", model)
 
@@ -540,7 +541,7 @@ def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
     for name, train_id in (("a", "road"), ("b", "sky")):
         with_classes(scene, tmp_path / name, lambda count, i=ID[train_id]: np.full(count, i, np.uint8))
         job = real.SplitJob(
-            tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), FitConfig(), SynthesizeConfig(), ADAPT, (), False,
+            tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), BenchConfig(), ADAPT, False,
         )  # fmt: skip
         real.write_seen(job, read_scene(tmp_path / name), real_protocols.HeldOut())
         fuse.run(FuseConfig(), job.scene, job.fused)

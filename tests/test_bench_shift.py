@@ -183,6 +183,8 @@ def test_what_a_log_lacks_is_left_out_and_named():
         "size_px": [8, 8],
         "cameras": ["front"],
         "held_out_every": 4,
+        "renders": True,
+        "continued_share": 0.5,
     }
     document = shift_tables.document(logs, rows, [2.0, 4.0], settings)
     assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
@@ -262,7 +264,7 @@ def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp
         assert state["summary"]["steps"] == 15
     assert store.digest(log / "fit" / "louder" / "gaussians.safetensors") != store.digest(log / "fit" / "mudg_s" / "gaussians.safetensors")
     assert store.read_json(log / "synthesize" / "run.json")["inputs"]["fitted"] == first
-    assert "generated with renders of that fit" in (out / "bench.md").read_text()
+    assert "generated with renders of the fit on recorded views" in (out / "bench.md").read_text()
 
 
 def test_stored_truth_is_the_drawn_truth(made):

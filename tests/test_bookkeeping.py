@@ -140,9 +140,13 @@ def test_names_as_long_as_can_be_work(tmp_path: Path) -> None:
     store.write_text(made.path / "out.txt", "1")
     made.finish()
     store.write_text(made.path / "out.txt", "2")
+    with pytest.raises(IntegrityError):
+        store.digest(made.path)
     again = run(made.path, overwrite=True)
-    store.write_text(again.path / "out.txt", "1")
+    store.write_text(again.path / "out.txt", "3")
     again.finish()
+    assert run(made.path).complete and (made.path / "out.txt").read_text() == "3"
+    assert [path.name for path in tmp_path.iterdir()] == ["a" * 230]  # nothing is left beside it
 
 
 def test_no_file_takes_the_place_of_a_device_or_folder(tmp_path: Path) -> None:

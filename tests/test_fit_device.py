@@ -422,11 +422,11 @@ def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():
 def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
     config = BenchConfig(device="cuda:1", methods=("street_gaussians",), variant=("wide=width_px:64",))
     fits = [row.fit for row in bench_shift.rows_of(config)] + [
-        row.changes for row in bench_real.rows_of(config) if row.changes
+        row.settings for row in bench_real.rows_of(config) if row.varied
     ]
     assert len(fits) == 3
     assert {
-        fitted.device for fitted in (*fits, bench_shift.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
+        fitted.device for fitted in (*fits, chain.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
     } == {"cuda:1"}
     monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
     assert chain.at_once(config) == 1

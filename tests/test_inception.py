@@ -188,8 +188,12 @@ def test_float64_agrees(state) -> None:
 # ---- weights that do not fit -----------------------------------------------------------------------------------------
 
 
-def test_counts_of_batches_are_left_alone(state) -> None:
-    inception.InceptionFeatures({**state, "Mixed_5b.branch1x1.bn.num_batches_tracked": torch.tensor(7)})
+def test_counts_of_batches_are_left_alone(network, state) -> None:
+    counted = inception.InceptionFeatures({**state, "Mixed_5b.branch1x1.bn.num_batches_tracked": torch.tensor(7)})
+    x = torch.rand(1, 192, 5, 5, generator=torch.Generator().manual_seed(4))
+    assert torch.equal(counted.block("Mixed_5b", x), network.block("Mixed_5b", x))
+    with pytest.raises(InputError, match="num_batches_seen"):  # of another name it is a tensor of another network
+        inception.InceptionFeatures({**state, "Mixed_5b.branch1x1.bn.num_batches_seen": torch.tensor(7)})
 
 
 def test_other_weights_are_refused_and_named(state) -> None:

@@ -232,6 +232,11 @@ def test_an_opaque_gaussian_can_be_stacked_too() -> None:
         model.table["logits"][:2] = 40.0
     relocate_and_grow(model, 10, SETTINGS, 0)
     assert all(torch.isfinite(value).all() for value in model.table.columns.values())
+    opacity = torch.sigmoid(model.table["logits"].detach().double())
+    assert sorted(set(tags(model))) == [0, 1]
+    for tag in (0, 1):  # a stack hides what is behind it as its one member did
+        member = torch.tensor([mine == tag for mine in tags(model)])
+        assert 1 - float((1 - opacity[member]).prod()) > 0.99
 
 
 def test_what_left_its_box_or_grew_too_large_is_dead() -> None:

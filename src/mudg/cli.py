@@ -191,7 +191,7 @@ def _bench(args: f.Bench) -> dict[str, Any]:
     from mudg.base import store
     from mudg.bench import run as bench
 
-    made = bench.run(args.name, args.settings, args.out, sources=args.sources, overwrite=args.overwrite)
+    made = bench.run(args.name, args.settings, args.out, sources=args.sources, preset=args.preset, overwrite=args.overwrite)
     return {"bench": made / "bench.json", "text": store.read_text(made / "bench.md")}
 
 
@@ -384,7 +384,8 @@ VERBS: dict[str, Verb] = {
          "mudg bench edit runs/a runs/b --out runs/edited",
          "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
          "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
-         "mudg bench paper city:reported --table mudg1 --out runs/mudg1"),
+         "mudg bench paper city:reported --table mudg1 --out runs/mudg1",
+         "mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2"),
         _bench,
     ),
 }  # fmt: skip

@@ -357,8 +357,8 @@ class Demo(DemoOwn):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bench(Output):
-    """Flags of ``mudg bench``."""
+class BenchInputs(Output):
+    """Flags of ``mudg bench`` without the settings."""
 
     name: Annotated[str, tyro.conf.Positional, arg(metavar="BENCHMARK")]
     """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off
@@ -366,7 +366,23 @@ class Bench(Output):
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, arg(metavar="[LOG ...]")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
     generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities."""
+    preset: stage_config.PresetName = "default"
+    """shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the
+    published set-up, with a published-type model."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench(BenchInputs):
+    """Flags of ``mudg bench``."""
+
     settings: Annotated[stage_config.BenchConfig, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchListed(BenchInputs):
+    """What ``mudg bench --help`` lists: all but the settings of steps."""
+
+    settings: Annotated[stage_config.BenchOwn, arg(name="")] = stage_config.BenchOwn()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -433,7 +449,7 @@ class DemoListed(DemoOwn):
 
 SECOND_INPUTS: dict[str, str] = {"render": "--model", "fit": "--fused", "synthesize": "--fused", "adapt": "--fused", "score": "--views"}
 """Commands whose second input may also stand right after the scene, without its flag."""
-CHAINS: dict[str, type[Common]] = {"demo": DemoListed, "run": RunListed}
+CHAINS: dict[str, type[Common]] = {"demo": DemoListed, "run": RunListed, "bench": BenchListed}
 """Commands that run several steps, with the flags that --help lists. --help-all adds some 200 settings of the steps."""
 
 
@@ -522,7 +538,7 @@ def _second_input_named(verb: str, words: Sequence[str]) -> Sequence[str]:
 def _own_help(verb: str, description: str) -> Common:
     """Print the flags of a chain itself, and where those of its steps are listed."""
     note = (
-        f"Every setting of a step is also a flag here, prefixed with the step's name: --fit.iterations 3000, --ingest.resolution 960.\n"
+        f"Every setting of a step is also a flag here, prefixed with the step's name: --fit.sh-degree 1, --synthesize.steps 4.\n"
         f"mudg {verb} --help-all lists them all; mudg fit --help and so on list those of one step, without the prefix."
     )
     _explain(CHAINS[verb], {})
@@ -544,7 +560,11 @@ def _settings(kind: type[Any], words: Sequence[str]) -> Any:
         except SystemExit:  # malformed: the real parser has the better message
             return kind()
     whole_chain = kind is stage_config.RunConfig
-    config = stage_config.run_preset(stage_config.chosen_preset(known.preset, known.fast)) if whole_chain else kind()
+    config: Any = kind()
+    if whole_chain:
+        config = stage_config.run_preset(stage_config.chosen_preset(known.preset, known.fast))
+    elif kind is stage_config.BenchConfig:
+        config = stage_config.bench_preset(known.preset or "default")
     if known.config is not None and kind is not stage_config.BatchConfig:  # there, the file is one of mudg run
         config = configuration.load(kind, config, known.config)
     if whole_chain:

@@ -258,18 +258,20 @@ def run(
 
 def bench(
     name: str, out: AnyPath, *,
-    sources: Sequence[AnyPath] = (), overwrite: bool = False, config: AnyPath | None = None, **settings: Any,
+    sources: Sequence[AnyPath] = (), overwrite: bool = False, preset: stage_config.PresetName = "default",
+    config: AnyPath | None = None, **settings: Any,
 ) -> Path:  # fmt: skip
     """Run a benchmark; returns the folder of ``bench.json``.
 
     Args:
-        name: ``mdm``, ``poses``, ``edit`` or ``shift``, against exact truth, or ``real``. sources: logs or scenes, for ``real``; finished
-            runs, for ``edit``.
+        name: ``mdm``, ``poses``, ``edit`` or ``shift``, against exact truth, ``real`` or ``paper``. sources: logs or scenes, for ``real``
+            and ``paper`` (which also takes ``city:reported``); finished runs, for ``edit``. preset: settings that ``shift``, ``real`` and
+            ``paper`` start from.
     """
     from mudg.bench import run as stage
 
-    made = _settings(stage_config.BenchConfig, config, settings)
-    return stage.run(name, made, Path(out), sources=[Path(source) for source in sources], overwrite=overwrite)
+    made = _settings(stage_config.BenchConfig, config, settings, stage_config.bench_preset(preset))
+    return stage.run(name, made, Path(out), sources=[Path(source) for source in sources], preset=preset, overwrite=overwrite)
 
 
 def doctor(scene: AnyPath | None = None) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def test_the_help_of_a_chain_is_short_and_says_where_the_rest_is(capsys: pytest.
         text = capsys.readouterr().out
         assert "--fit.method" not in text
         assert f"mudg {verb} --help-all" in text.replace("\n", " ")
-        assert "--shifts-m" in text
+        assert ("--protocols" if verb == "bench" else "--shifts-m") in text
 
 
 def test_help_lists_only_what_exists() -> None:

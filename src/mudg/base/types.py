@@ -426,6 +426,8 @@ class Condition:
         depth: f32[T, 1, H, W] metres; meaningless where not valid.
         valid: bool[T, 1, H, W]: a fused point was seen here.
         reference: f32[3, H, W], the dense recorded image near views[0].
+        reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as released), in that
+            frame alone, or nowhere.
         warped: bool[T, 1, H, W] or None: the colour here was warped from a recorded image near in time.
         backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
         semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 = unknown.
@@ -448,6 +450,7 @@ class Condition:
     renders: RenderPlanes | None = None
     effect: Tensor | None = None
     measured: SparseDepth | None = None
+    reference_in: Literal["tokens_and_frame", "frame", "nowhere"] = "tokens_and_frame"
 
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg import native
+from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import run_in_processes
@@ -24,8 +25,10 @@ from mudg.data.observations import list_observation_sets
 from mudg.methods import METHODS
 from mudg.report.score_tables import title_of
 from mudg.stages import fit, synthesize
-from mudg.stages.config import BenchConfig, FitConfig, SynthesizeConfig
-from mudg.stages.run import WITHOUT_DIFFUSION, fits_of
+from mudg.stages.config import BenchConfig, FitConfig, PresetName, SynthesizeConfig, bench_preset
+from mudg.stages.fitting.recipes import recipe_of
+from mudg.stages.learning import loading
+from mudg.stages.run import CONTINUED_SHARE, WITHOUT_DIFFUSION, fits_of, refuse_missing
 
 _NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
 _NO_CLASSES: Final = {"semantic_weight": 0.0}
@@ -44,6 +47,102 @@ LONGER_TITLE: Final = title_of(WITHOUT_DIFFUSION) + ", as many iterations"
 REPAIRED: Final = "difix"
 REPAIR_STEPS: Final = 3
 """Steps in which repaired views move from the recorded path to the places of generated views."""
+
+
+PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
+"""Settings of generated views that are the benchmark's matter, not the user's."""
+
+
+# ---- settings ----
+
+
+def generator_of(config: BenchConfig) -> SynthesizeConfig:
+    """How views are generated, by the benchmark's model, number format, seed and device; one trajectory at a time."""
+    return replace(
+        config.synthesize, model=config.model, precision=config.precision, seed=config.seed, device=config.device, processes=1
+    )
+
+
+def usual_fit(config: BenchConfig) -> FitConfig:
+    """The settings of fits, as ``mudg run`` takes them for the whole chain."""
+    return replace(config.fit, method="mudg_s", iterations=config.iterations, seed=config.seed, device=config.device)
+
+
+def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
+    """The usual settings with a method. What a preset sets and a method for comparison does not know has its default there.
+
+    Raises:
+        UsageError: a setting beyond the preset that the method does not know.
+    """
+    recipe, named, plain = recipe_of(method), bench_preset(preset).fit, FitConfig()
+    settings = configuration.load(FitConfig, usual, overrides={"method": method})
+    for name in (*recipe.unfit, *(f"loss.{weight}" for weight in recipe.own_weights)):
+        group, _, field = name.partition(".")
+        own, set_by_preset = getattr(settings, group), getattr(getattr(named, group), field)
+        if getattr(own, field) == set_by_preset:
+            settings = replace(settings, **{group: replace(own, **{field: getattr(getattr(plain, group), field)})})
+    recipe.check(settings, False)
+    return settings
+
+
+def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
+    """What the chain of a benchmark runs with, for ``bench.json``; ``continued_share`` is None where fits under virtual views begin from
+    nothing."""
+    generator = configuration.result_settings(generator_of(config))
+    return {
+        "preset": preset, "continued_share": CONTINUED_SHARE if config.continue_fit else None,
+        "fuse": configuration.result_settings(config.fuse), "fit": configuration.result_settings(usual_fit(config)),
+        "synthesize": {name: value for name, value in generator.items() if name not in PLACES},
+    }  # fmt: skip
+
+
+def refuse_unfit(
+    config: BenchConfig, preset: PresetName, fits: Sequence[FitConfig], generators: Sequence[SynthesizeConfig], renders: bool
+) -> None:
+    """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use.
+
+    Args:
+        fits: of all rows that fit a scene. generators: settings behind all views that are generated for a row itself. renders: whether
+            the diffusion model sees renders of the first fit.
+
+    Raises:
+        UsageError: a setting that no row uses, weights that are asked for and not given, or a method that the model cannot serve.
+        InputError: there is no such model.
+    """
+    virtual = [settings for settings in fits if {"virtual", "repaired"} & set(METHODS[settings.method].supervision)]
+    if any(settings.method == REPAIRED for settings in fits) and not renders:
+        raise UsageError(f"{REPAIRED} repairs renders, and this diffusion model uses none", where="--methods", got=config.model,
+                         remedy=f"leave {REPAIRED} out, or choose another --model")  # fmt: skip
+    if fits and not config.continue_fit and LONGER in config.methods:
+        raise UsageError("with --no-continue-fit every fit has the same iterations, so this row is that of "
+                         f"{WITHOUT_DIFFUSION}", where="--methods", got=LONGER, remedy="leave it out")  # fmt: skip
+    idle = {
+        "no row of this table generates views": () if generators or virtual else ("synthesize",),
+        "no row of this table fits a scene": () if fits or (renders and generators) else ("fit", "iterations", "continue_fit"),
+        "no row of this table learns from virtual views": () if virtual else ("fit.virtual", "continue_fit"),
+    }
+    for name in changed_settings(config, bench_preset(preset)):
+        for reason, unused in idle.items():
+            if any(name == one or name.startswith(f"{one}.") for one in unused):
+                raise UsageError("this setting would change nothing", where=flag_of(name), got=reason, remedy="leave it out")
+    if generators or virtual:
+        refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
+    for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
+        loading.check_config(generator, fitted=False)
+
+
+def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:
+    """Dotted names of the settings in which a configuration differs from another."""
+    lines = configuration.differences(configuration.to_dict(usual), configuration.to_dict(config))
+    return [line.partition(":")[0] for line in lines]
+
+
+def flag_of(name: str) -> str:
+    """The flag of a setting."""
+    return f"--{name.replace('_', '-')}"
+
+
+# ---- logs ----
 
 
 def each_log(make: Callable[[Any], Any], jobs: Sequence[Any], names: Sequence[str], processes: int) -> list[Any]:
@@ -125,6 +224,7 @@ class FitChain:
         out: folder of all. scene, fused: what is fitted.
         usual: settings of the whole chain, as ``mudg run`` takes them; the first fit has them.
         overwrite: replace what other settings left there.
+        continued: fits under virtual views go on with one without; else they begin from nothing, with all iterations.
         generator: settings of generated views, whose places are those of repaired ones.
     """
 
@@ -133,6 +233,7 @@ class FitChain:
     fused: Path
     usual: FitConfig
     overwrite: bool
+    continued: bool = True
     generator: SynthesizeConfig | None = None
 
     def first(self) -> Path:
@@ -153,7 +254,9 @@ class FitChain:
             return self._repaired(name, settings)
         if not learns_virtual(settings):
             return self._made(settings, out)
-        plain, guided = fits_of(settings)
+        plain, guided = fits_of(settings, self.continued)
+        if not self.continued:
+            return self._made(guided, out, virtual)
         plain = replace(plain, virtual=self.usual.virtual)
         begun = self.first() if plain == fits_of(self.usual)[0] else self._made(plain, self.out / "start" / name)
         return self._made(guided, out, virtual, begun)

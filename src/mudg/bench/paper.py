@@ -27,11 +27,16 @@ from mudg.bench.chain import (
     REPAIRED,
     FitChain,
     at_once,
+    chain_settings,
     each_log,
+    generator_of,
     learns_virtual,
     made,
+    method_fit,
     refuse_foreign,
+    refuse_unfit,
     seconds_of,
+    usual_fit,
 )
 from mudg.bench.paper_logs import ListedCity, PaperLog, facts_of, logs_of, make_scene, missing_scenes, scored_cameras
 from mudg.bench.paper_tables import RECORDED, TABLES, PaperRow, PaperTable, further_columns
@@ -39,21 +44,27 @@ from mudg.bench.shift import PERCEPTUAL_VIEWS, write_fill
 from mudg.data.scene import read_scene
 from mudg.methods import METHODS
 from mudg.models.mdm import files as mdm_files
+from mudg.models.published.files import is_published
 from mudg.stages import fuse, render, score, score_truth, synthesize
 from mudg.stages.config import (
     BenchConfig,
     FitConfig,
-    FuseConfig,
+    PresetName,
     RenderConfig,
     ScoreConfig,
     SynthesizeConfig,
     on_device,
 )
-from mudg.stages.run import CONTINUED_SHARE, WITHOUT_DIFFUSION
+from mudg.stages.run import WITHOUT_DIFFUSION
 
 FILL, TRUTH = score.BASELINE, "truth"
 PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
 ALL_VIEWS: Final = 1_000_000
+SAMPLING: Final = (
+    "steps", "sampler", "eta", "overlap", "align_depth", "full_size", "guidance", "guidance_rescale", "memory_budget_gb", "offload",
+    "compiled",
+)  # fmt: skip
+"""Settings of generated views that published-type and small models do not share."""
 PER_LOG: Final = ("detections", "lanes", "video_features")
 """Settings of a score that name what was made of the views of one log."""
 
@@ -66,11 +77,10 @@ class PaperJob:
     out: Path
     table: PaperTable
     rows: tuple[PaperRow, ...]
-    usual: FitConfig
-    generator: SynthesizeConfig
+    config: BenchConfig
+    preset: PresetName
     score: ScoreConfig
     renders: bool
-    videos: bool
     overwrite: bool
 
     @property
@@ -80,7 +90,7 @@ class PaperJob:
 
     def fits(self, scene: Path) -> FitChain:
         """The fits."""
-        return FitChain(self.out, scene, self.fused, self.usual, self.overwrite)
+        return FitChain(self.out, scene, self.fused, usual_fit(self.config), self.overwrite, self.config.continue_fit)
 
 
 @dataclass(frozen=True)
@@ -93,18 +103,20 @@ class Asked:
     drawn: RenderConfig
 
 
-def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
+def run(
+    config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False
+) -> Path:
     """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown, CSV and LaTeX, and ``page.html``.
 
     Args:
-        config: see ``BenchConfig``; fields marked paper, and model, precision, iterations and seed.
+        config: see ``BenchConfig``; fields marked paper, and model, precision, iterations and seed. preset: what it started from.
         sources: ``city:reported`` (or another list of cities), or folders of recorded logs.
         out: what lies there of the same settings is reused; logs and methods may be added later.
         overwrite: replace what other settings left there.
 
     Raises:
-        UsageError: an unknown method or list, or ``out`` holds something else. InputError: methods have different numbers of views.
-            Whatever a verb raises.
+        UsageError: an unknown method or list, a setting that no row of the table uses, or ``out`` holds something else. InputError:
+            methods have different numbers of views. Whatever a verb raises.
     """
     table, out = TABLES[config.table], Path(out)
     rows = rows_of(config, table)
@@ -117,23 +129,20 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
     refuse_foreign(
         out, PAGES, lambda document: document["bench"] == "paper" and document["table"]["name"] == table.name
     )
-    usual = FitConfig(method="mudg_s", iterations=config.iterations, seed=config.seed, device=config.device)
-    generator = SynthesizeConfig(model=config.model, precision=config.precision, processes=1, seed=config.seed)
     measured = on_device(score_settings(config.score, table), config.device)
     renders = mdm_files.uses_renders(config.model)
-    jobs = [
-        PaperJob(
-            log, out / log.name, table, rows, usual, on_device(generator, config.device), of_log(measured, log.name), renders,
-            config.videos, overwrite,
-        )
-        for log in logs
-    ]  # fmt: skip
+    counted = [row for row in rows if row.changes.get("model") != ""]
+    fits = [fit_of(config, preset, row) for row in counted if METHODS[row.method].made_by == "render"]
+    generators = [
+        replace(generator_of(config), **row.changes) for row in counted if METHODS[row.method].made_by == "synthesize"
+    ]
+    refuse_unfit(config, preset, fits, generators, renders)
+    jobs = [PaperJob(log, out / log.name, table, rows, config, preset, of_log(measured, log.name), renders, overwrite) for log in logs]
     found = each_log(make_log, jobs, [log.name for log in logs], at_once(config))
     settings = {
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "", "missing_scenes": list(missing_scenes(table, logs)),
         "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model), "renders": renders,
-        "continued_share": CONTINUED_SHARE, "videos": config.videos, "score": configuration.result_settings(measured),
-        "digests": digests,
+        "videos": config.videos, "score": configuration.result_settings(measured), "digests": digests, **chain_settings(config, preset),
     }  # fmt: skip
     together = paper_sets.pooled(found, out)
     document = paper_numbers.document(table, found, [_values_of(row) for row in rows], settings, together)
@@ -156,18 +165,32 @@ def rows_of(config: BenchConfig, table: PaperTable) -> tuple[PaperRow, ...]:
             raise UsageError(
                 "this table has rows of its own", where="--methods", expected="not given", got=", ".join(config.methods)
             )
+        if config.freevs_model:
+            raise UsageError("this table has no row freevs", where="--freevs-model", got=f"--table {table.name}", remedy="leave it out")
         return table.rows
     known = with_control(tuple(METHODS))
-    asked = known if config.methods == usual else tuple(name for name in config.methods if name != FILL)
+    asked = tuple(name for name in config.methods if name != FILL)
+    if config.methods == usual:
+        asked = known if config.continue_fit else tuple(name for name in known if name != LONGER)
     unknown = sorted(set(asked) - set(known))
     if unknown:
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
-    own = {"freevs": {"condition": "freevs", "model": config.freevs_model}}
+    if config.freevs_model and "freevs" not in asked:
+        raise UsageError("no row freevs was asked for", where="--freevs-model", got=f"--methods {' '.join(config.methods)}",
+                         remedy="leave it out, or add freevs to --methods")  # fmt: skip
+    own: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": config.freevs_model}}
+    if config.freevs_model and is_published(config.model):  # the row's own model is a small one, which samples in its own way
+        own["freevs"] |= {name: getattr(SynthesizeConfig(), name) for name in SAMPLING}
     if not mdm_files.uses_renders(config.model):
         own[REPAIRED] = {"model": ""}
     control = PaperRow(LONGER, f"{LONGER_TITLE} ({LONGER})", WITHOUT_DIFFUSION)
     rows = {row.name: row for row in table.rows_of(tuple(name for name in asked if name != LONGER))} | {LONGER: control}
     return tuple(replace(rows[name], changes=own.get(rows[name].method, rows[name].changes)) for name in asked)
+
+
+def fit_of(config: BenchConfig, preset: PresetName, row: PaperRow) -> FitConfig:
+    """The settings of a row's fit."""
+    return configuration.load(FitConfig, method_fit(usual_fit(config), row.method, preset), overrides=dict(row.changes))
 
 
 def with_control(methods: tuple[str, ...]) -> tuple[str, ...]:
@@ -210,8 +233,8 @@ def _values_of(row: PaperRow) -> dict[str, Any]:
 
 def make_log(job: PaperJob) -> dict[str, Any]:
     """Everything of one log; returns its facts, per row and place the values with their numbers of views, and seconds."""
-    scene = make_scene(job.log, job.table, job.out, job.usual.device, job.overwrite)
-    made(lambda o: fuse.run(FuseConfig(), scene, job.fused, overwrite=o), job.overwrite)
+    scene = make_scene(job.log, job.table, job.out, job.config.device, job.overwrite)
+    made(lambda o: fuse.run(job.config.fuse, scene, job.fused, overwrite=o), job.overwrite)
     asked = asked_of(job, scene)
     truth: Path | None = None
     if isinstance(job.log, ListedCity):
@@ -245,7 +268,7 @@ def make_log(job: PaperJob) -> dict[str, Any]:
     shown = {**({} if truth is None else {TRUTH: truth}), **views}
     # With another method the old pictures are out of date, whatever was asked.
     made(
-        lambda o: shift_page.film(shown, asked.paths, job.out / "film", videos=job.videos, overwrite=o), overwrite=True
+        lambda o: shift_page.film(shown, asked.paths, job.out / "film", videos=job.config.videos, overwrite=o), overwrite=True
     )
     return {
         **facts_of(job.log, read_scene(scene)), "exact": truth is not None, "values": values, "features": places,
@@ -265,12 +288,12 @@ def asked_of(job: PaperJob, scene: Path) -> Asked:
     cameras = scored_cameras(loaded, table)
     shifts = tuple(dict.fromkeys(s if len(p.shifts_m) > 1 else side * s for p in table.places for s in p.shifts_m))
     further = tuple(dict.fromkeys(name for place in table.places for name in place.paths))
-    drawn = RenderConfig(cameras=cameras, shifts_m=shifts, paths=further, video=False, device=job.usual.device)
+    drawn = RenderConfig(cameras=cameras, shifts_m=shifts, paths=further, video=False, device=job.config.device)
     off = tuple(s for s in shifts if s) or table.virtual_shifts_m
     return Asked(
         cameras,
         render.trajectories(loaded, drawn),
-        replace(job.generator, cameras=cameras, shifts_m=off, paths=further),
+        replace(generator_of(job.config), cameras=cameras, shifts_m=off, paths=further),
         drawn,
     )
 
@@ -289,7 +312,7 @@ def views_of(job: PaperJob, row: PaperRow, scene: Path, asked: Asked) -> tuple[P
             on_path = replace(asked.off_path, shifts_m=(0.0,), paths=(), **row.changes)
             found.append(_generated(job, on_path, scene, first, job.out / "generated" / f"{row.name}-{RECORDED}"))
         return tuple(found)
-    settings = configuration.load(FitConfig, job.usual, overrides={"method": row.method, **row.changes})
+    settings = fit_of(job.config, job.preset, row)
     virtual: tuple[Path, ...] = ()
     if learns_virtual(settings):
         first = fits.first() if job.renders else None

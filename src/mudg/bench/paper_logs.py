@@ -83,6 +83,8 @@ def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> 
         )  # fmt: skip
     if lists:
         return _cities(config, lists[0], table)
+    if config.logs != BenchConfig().logs:
+        raise UsageError("recorded logs are counted by naming them", where="--logs", got=str(config.logs), remedy="leave it out")
     found = names_of(sources)
     return tuple(_recorded(config, name, source, table) for name, source in found.items())
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from mudg.bench.shift_tables import virtual_fits_of
 from mudg.report.score_tables import markdown_table
 
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
@@ -57,8 +58,7 @@ def notes_of(doc: Mapping[str, Any]) -> list[str]:
     ours = "generated cities, not the paper's data" if settings["list"] else "the logs below"
     notes = [
         f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by number.",
-        f"Every fit has {settings['iterations']} iterations, under virtual views {settings['continued_share']:g} times as many more; seed "
-        f"{settings['seed']}.",
+        f"Every fit has {settings['iterations']} iterations, {virtual_fits_of(settings)}; seed {settings['seed']}.",
         "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows are not ranked.",
         *table["notes"],
         *_empty_columns(doc),

@@ -28,7 +28,19 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, is_temporary, refuse_overlap
 from mudg.base.types import Scene
 from mudg.bench import real_measure, real_page, real_tables, real_truth
-from mudg.bench.chain import LONGER, LONGER_TITLE, FitChain, at_once, learns_virtual, made
+from mudg.bench.chain import (
+    LONGER,
+    LONGER_TITLE,
+    FitChain,
+    at_once,
+    chain_settings,
+    generator_of,
+    learns_virtual,
+    made,
+    method_fit,
+    refuse_unfit,
+    usual_fit,
+)
 from mudg.bench.real_protocols import (
     PROTOCOLS,
     SPLITS,
@@ -52,15 +64,13 @@ from mudg.stages.config import (
     AnnotateConfig,
     BenchConfig,
     FitConfig,
-    FuseConfig,
     IngestConfig,
+    PresetName,
     RenderConfig,
-    SynthesizeConfig,
     on_device,
 )
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, "street_gaussians", "mudg_r", "mudg_s"
-VIRTUAL_SHIFTS_M: Final = SynthesizeConfig().shifts_m
 _PAGES: Final = ("bench.json", "bench.md", "page.html")
 _PART: Final = VerbOutput("part of a scene", 1, SCENE_FILES)
 _NAME: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
@@ -80,14 +90,15 @@ class RealMethod:
 
     Args:
         name: in tables and folders. fit: method of ``mudg fit``; empty for methods without a fit. sees: how it uses the diffusion model,
-            as far as model and log allow; empty for methods without one. changes: settings of the fit in place of those of all fits.
+            as far as model and log allow; empty for methods without one. settings: of its fit. varied: in place of those of all fits.
         longer: goes on with the first fit for as many iterations as fits under generated views do, without such views.
     """
 
     name: str
     fit: str = ""
     sees: Sees | Literal[""] = ""
-    changes: FitConfig | None = None
+    settings: FitConfig | None = None
+    varied: bool = False
     longer: bool = False
 
     @property
@@ -95,7 +106,7 @@ class RealMethod:
         """For tables."""
         if self.longer:
             return LONGER_TITLE
-        if not self.sees or self.changes is not None:
+        if not self.sees or self.varied:
             return title_of(self.name)
         return title_of(self.name.removesuffix(LESS[self.sees])) + _LESS_TITLES[self.sees]
 
@@ -122,10 +133,8 @@ class SplitJob:
     split: Split
     protocols: tuple[Protocol, ...]
     rows: tuple[RealMethod, ...]
-    usual: FitConfig
-    generator: SynthesizeConfig
+    config: BenchConfig
     adapt: AdaptConfig
-    shown: tuple[str, ...]
     overwrite: bool
 
     @property
@@ -146,45 +155,44 @@ class SplitJob:
     @property
     def fits(self) -> FitChain:
         """The fits."""
-        return FitChain(self.folder, self.scene, self.fused, self.usual, self.overwrite, self.generator)
+        return FitChain(self.folder, self.scene, self.fused, usual_fit(self.config), self.overwrite, self.config.continue_fit)
 
 
 def run(
-    config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: bool = False,
-    virtual_shifts_m: Sequence[float] = VIRTUAL_SHIFTS_M, adaptation: AdaptConfig | None = None,
+    config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False,
+    adaptation: AdaptConfig | None = None,
 ) -> Path:  # fmt: skip
     """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
 
     Args:
-        config: see ``BenchConfig``; fields marked real, and model, precision and seed.
+        config: see ``BenchConfig``; fields marked real, and model, precision and seed. preset: what it started from.
         sources: folders of dataset logs, or scenes made by ``mudg ingest``.
         out: what lies there of the same settings is reused; logs, protocols and methods may be added later.
         overwrite: replace what other settings left there.
-        virtual_shifts_m: lateral shifts, metres, of the generated views that fits learn from.
         adaptation: how the diffusion model is adapted to a log; its model, cameras, precision and seed are those of ``config``.
 
     Raises:
-        UsageError: no log, an unknown method or protocol, two logs of one name, or ``out`` holds something else. Whatever a verb raises.
+        UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one name, or ``out`` holds something
+            else. Whatever a verb raises.
     """
-    rows, protocols = rows_of(config), protocols_of(config)
+    rows, protocols = rows_of(config, preset), protocols_of(config)
     logs = names_of(sources)
     refuse_overlap(
         out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
     )
     _refuse_foreign(Path(out))
-    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
-    training = replace(
-        adaptation or AdaptConfig(), model=config.model, precision=config.precision, processes=1, seed=config.seed
-    )
-    generator = SynthesizeConfig(
-        shifts_m=tuple(virtual_shifts_m), model=config.model, precision=config.precision, processes=1, seed=config.seed
-    )
+    generates = any(row.sees and not row.fit for row in rows)
+    renders = mdm_files.uses_renders(config.model)
+    refuse_unfit(config, preset, [row.settings for row in rows if row.settings], [generator_of(config)] * generates, renders)
+    training = replace(adaptation or AdaptConfig(), model=config.model, processes=1, seed=config.seed)
+    if renders:  # no other model is adapted
+        training = replace(training, precision=config.precision)
     scenes = {name: _scene_of(config, path, Path(out) / name, overwrite) for name, path in logs.items()}
     splits = tuple(dict.fromkeys(protocol.split for protocol in protocols))
     jobs = [
         SplitJob(
-            Path(out) / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, usual,
-            on_device(generator, config.device), on_device(training, config.device), config.shown, overwrite,
+            Path(out) / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, config,
+            on_device(training, config.device), overwrite,
         )
         for name, scene in scenes.items() for split in splits
     ]  # fmt: skip
@@ -193,7 +201,7 @@ def run(
         _entry_of(name, path, [f for j, f in zip(jobs, found) if j.out.name == name]) for name, path in scenes.items()
     ]
     document = real_tables.document(
-        entries, [_row_values(row) for row in rows], protocols, settings_of(config, virtual_shifts_m)
+        entries, [_row_values(row) for row in rows], protocols, {**settings_of(config), **chain_settings(config, preset)}
     )
     store.write_json(Path(out) / "bench.json", document)
     store.write_text(Path(out) / "bench.md", real_tables.markdown(document))
@@ -204,23 +212,27 @@ def run(
 # ---- what is compared, and on what ----
 
 
-def rows_of(config: BenchConfig) -> tuple[RealMethod, ...]:
+def rows_of(config: BenchConfig, preset: PresetName = "default") -> tuple[RealMethod, ...]:
     """The methods and variants of a configuration, in the order of the tables.
 
     Raises:
-        UsageError: an unknown method, or a malformed or repeated variant.
+        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant.
     """
     known = [row.name for row in METHOD_ROWS]
     unknown = sorted(set(config.methods) - set(known))
     if unknown or not config.methods:
         raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
     wanted = {*config.methods, *(ABLATION if config.ablation else ())}
-    rows = [row for row in METHOD_ROWS if row.name in wanted]
-    usual = FitConfig(method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
+    if not config.continue_fit and LONGER not in config.methods:
+        wanted -= {LONGER}
+    usual = usual_fit(config)
+    rows = [
+        replace(row, settings=method_fit(usual, row.fit, preset) if row.fit else None) for row in METHOD_ROWS if row.name in wanted
+    ]
     for text in config.variant:
         changed = variant_of(text, usual)
         learns = changed.fit is not None and learns_virtual(changed.fit)
-        rows.append(RealMethod(changed.name, FULL, "adapted" if learns else "", changed.fit))
+        rows.append(RealMethod(changed.name, FULL, "adapted" if learns else "", changed.fit, varied=True))
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
         raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
@@ -274,16 +286,16 @@ def _scene_of(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> 
 
 
 def _row_values(row: RealMethod) -> dict[str, Any]:
-    changes = None if row.changes is None else configuration.result_settings(row.changes)
+    changes = configuration.result_settings(row.settings) if row.varied else None
     return {"name": row.name, "title": row.title, "fit": row.fit, "sees": row.sees, "changes": changes}
 
 
-def settings_of(config: BenchConfig, virtual_shifts_m: Sequence[float]) -> dict[str, Any]:
+def settings_of(config: BenchConfig) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
         "protocols": list(config.protocols), "iterations": config.iterations, "seed": config.seed,
         "model": mdm_files.digest(config.model), "shown_cameras": list(config.shown), "resolution": config.resolution,
-        "frames": config.frames, "virtual_shifts_m": list(virtual_shifts_m),
+        "frames": config.frames, "virtual_shifts_m": list(config.synthesize.shifts_m),
     }  # fmt: skip
 
 
@@ -320,7 +332,7 @@ def _run_jobs(jobs: Sequence[SplitJob], processes: int) -> list[dict[str, Any]]:
 def make_split(job: SplitJob) -> dict[str, Any]:
     """Everything of one log under one way of hiding; returns values by protocol and method, facts, and why protocols were left out."""
     whole = read_scene(job.source)
-    held = held_out(whole, job.split, job.shown)
+    held = held_out(whole, job.split, job.config.shown)
     if held.reason:
         return {
             "split": job.split.name,
@@ -346,7 +358,7 @@ def make_split(job: SplitJob) -> dict[str, Any]:
         left_out = {} if protocol in wanted else {"left_out": targets.reason}
         found[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}, **left_out}
     if wanted:
-        made(lambda o: fuse.run(FuseConfig(), job.scene, job.fused, overwrite=o), job.overwrite)
+        made(lambda o: fuse.run(job.config.fuse, job.scene, job.fused, overwrite=o), job.overwrite)
     used: dict[str, dict[str, str]] = {}
     for row in job.rows if wanted else ():
         views, use = views_of(job, row, cameras)
@@ -356,7 +368,7 @@ def make_split(job: SplitJob) -> dict[str, Any]:
             scored = job.out / "score" / protocol.name / row.name
             made(
                 lambda o, p=protocol, v=views, s=scored: real_measure.write_scores(
-                    p, job.source, truths[p.name], v, s, overwrite=o, device=job.usual.device
+                    p, job.source, truths[p.name], v, s, overwrite=o, device=job.config.device
                 ),
                 job.overwrite,
             )
@@ -374,7 +386,7 @@ def write_seen(job: SplitJob, whole: Scene, held: HeldOut) -> None:
     inputs = {"log": store.digest(job.source)}
     shown = job.folder / "shown"
     _write(job, shown, inputs, lambda root: write_part(whole, root, frames, sweeps))
-    settings = on_device(AnnotateConfig(processes=1), job.usual.device)
+    settings = on_device(AnnotateConfig(processes=1), job.config.device)
     labels = shown
     if not all(annotate.wanted_labels(settings) <= set(f.labels) for f in whole.frames if f.id in frames):
         labels = job.folder / "annotate"
@@ -390,7 +402,7 @@ def _write(job: SplitJob, out: Path, inputs: dict[str, str], write: Callable[[Pa
     """Write a part of a scene as a folder that is verified and reused."""
 
     def make(overwrite: bool) -> Path:
-        folder = RunDir.open(out, _PART, {"split": job.split.name, "shown": list(job.shown)}, inputs, overwrite)
+        folder = RunDir.open(out, _PART, {"split": job.split.name, "shown": list(job.config.shown)}, inputs, overwrite)
         if folder.complete:
             return folder.reused()
         scene = write(folder.path)
@@ -403,7 +415,7 @@ def _write(job: SplitJob, out: Path, inputs: dict[str, str], write: Callable[[Pa
 def _asked_cameras(job: SplitJob, whole: Scene, held: HeldOut) -> tuple[str, ...]:
     """The cameras whose views are asked for."""
     if not job.split.all_cameras:
-        return (first_camera(whole, job.shown),)
+        return (first_camera(whole, job.config.shown),)
     hidden = {frame.view.camera.name for frame in places_of(whole, held)}
     return tuple(name for name in whole.cameras if name in hidden)
 
@@ -414,7 +426,7 @@ def _asked_cameras(job: SplitJob, whole: Scene, held: HeldOut) -> tuple[str, ...
 def views_of(job: SplitJob, row: RealMethod, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
     """The folder with a method's views at all places that are asked for, made if need be; and how it used the diffusion model."""
     places = job.folder / "asked" if (job.folder / "asked").is_dir() else job.scene
-    drawn = RenderConfig(cameras=cameras, shifts_m=job.split.shifts_m, video=False, device=job.usual.device)
+    drawn = RenderConfig(cameras=cameras, shifts_m=job.split.shifts_m, video=False, device=job.config.device)
     if row.name == FILL:
         paths = render.trajectories(read_scene(places), drawn)
         fill = job.folder / FILL
@@ -431,14 +443,14 @@ def fitted(job: SplitJob, row: RealMethod, use: DiffusionUse | None, cameras: tu
     of hidden frames are asked for."""
     if row.longer:
         return job.fits.longer(row.name)
-    settings = row.changes or configuration.load(FitConfig, job.usual, overrides={"method": row.fit})
+    settings = row.settings or usual_fit(job.config)
     virtual: list[Path] = []
     if use is not None:
-        camera = first_camera(read_scene(job.scene), job.shown)
-        virtual.append(generated(job, use, (camera,), job.generator.shifts_m, job.folder / "virtual" / use.sees))
+        camera = first_camera(read_scene(job.scene), job.config.shown)
+        virtual.append(generated(job, use, (camera,), job.config.synthesize.shifts_m, job.folder / "virtual" / use.sees))
         if job.split.by_camera or job.split.block:
             virtual.append(generated(job, use, cameras, job.split.shifts_m, job.folder / "generated" / use.sees))
-    beside = replace(job.generator, cameras=(first_camera(read_scene(job.scene), job.shown),))
+    beside = replace(generator_of(job.config), cameras=(first_camera(read_scene(job.scene), job.config.shown),))
     return replace(job.fits, generator=beside).fitted(row.name, settings, virtual)
 
 
@@ -456,7 +468,7 @@ def diffusion_use(job: SplitJob, asked: Sees) -> DiffusionUse:
 
     What the model or the log does not allow is left out, and the note says so.
     """
-    given = job.generator.model
+    given = job.config.model
     if asked == "points":
         return DiffusionUse("points", given)
     if not mdm_files.uses_renders(given):
@@ -464,7 +476,7 @@ def diffusion_use(job: SplitJob, asked: Sees) -> DiffusionUse:
     if asked == "renders":
         return DiffusionUse("renders", given)
     scene = read_scene(job.scene)
-    settings = replace(job.adapt, cameras=(first_camera(scene, job.shown),))
+    settings = replace(job.adapt, cameras=(first_camera(scene, job.config.shown),))
     reason, folder = why_not(scene, settings), job.folder / "adapt"
     if not reason:
         first = job.fits.first()
@@ -485,7 +497,7 @@ def generated(
     job: SplitJob, use: DiffusionUse, cameras: tuple[str, ...], shifts_m: tuple[float, ...], out: Path
 ) -> Path:
     """Views of the diffusion model, made if need be; on top of renders of the first fit unless it sees points alone."""
-    settings = replace(job.generator, cameras=cameras, shifts_m=shifts_m, model=use.model)
+    settings = replace(generator_of(job.config), cameras=cameras, shifts_m=shifts_m, model=use.model)
     first = None if use.sees == "points" else job.fits.first()
     return made(
         lambda o: synthesize.run(settings, job.scene, job.fused, out, fitted=first, overwrite=o), job.overwrite

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from mudg.bench.real_measure import COLUMNS, compared, compared_text, number_text
 from mudg.bench.real_protocols import Protocol
+from mudg.bench.shift_tables import virtual_fits_of
 from mudg.report.score_tables import markdown_table
 
 AGAINST: Final = "street_gaussians"
@@ -127,8 +128,8 @@ def summary_of(doc: Mapping[str, Any]) -> str:
     """One line about the whole."""
     settings, count = doc["settings"], len(doc["logs"])
     return (
-        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit, under virtual views half as "
-        f"many more after the fit on recorded views; seed {settings['seed']}."
+        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; "
+        f"seed {settings['seed']}."
     )
 
 

@@ -30,11 +30,16 @@ from mudg.bench.chain import (
     VIRTUAL_TERMS,
     FitChain,
     at_once,
+    chain_settings,
     each_log,
+    generator_of,
     learns_virtual,
     made,
+    method_fit,
     refuse_foreign,
+    refuse_unfit,
     seconds_of,
+    usual_fit,
 )
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
@@ -48,14 +53,12 @@ from mudg.stages import fuse, ingest, render, score, score_truth, synthesize
 from mudg.stages.config import (
     BenchConfig,
     FitConfig,
-    FuseConfig,
     IngestConfig,
+    PresetName,
     RenderConfig,
     ScoreConfig,
     SynthesizeConfig,
-    on_device,
 )
-from mudg.stages.run import CONTINUED_SHARE
 
 TEST_EVERY: Final = 4
 PERCEPTUAL_VIEWS: Final = 12
@@ -94,54 +97,52 @@ class LogJob:
     rules: LogRules
     shifts_m: tuple[float, ...]
     rows: tuple[Row, ...]
-    usual: FitConfig
+    config: BenchConfig
     synthesize: SynthesizeConfig
     renders: bool
-    videos: bool
     overwrite: bool
 
     @property
     def fits(self) -> FitChain:
         """The fits."""
-        return FitChain(self.out, self.out / "scene", self.out / "fuse", self.usual, self.overwrite, self.synthesize)
+        config, out = self.config, self.out
+        return FitChain(
+            out, out / "scene", out / "fuse", usual_fit(config), self.overwrite, config.continue_fit, self.synthesize
+        )
 
 
 def run(
-    config: BenchConfig, out: Path, *, overwrite: bool = False, rules: LogRules = STANDARD,
+    config: BenchConfig, out: Path, *, preset: PresetName = "default", overwrite: bool = False, rules: LogRules = STANDARD,
     distances_m: Sequence[float] = (2.0, 3.0, 4.0),
 ) -> Path:  # fmt: skip
     """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
 
     Args:
-        config: see ``BenchConfig``; fields marked shift, and model, precision and seed.
+        config: see ``BenchConfig``; fields marked shift, and model, precision and seed. preset: what it started from.
         out: what lies there of the same settings is reused; other methods and variants may be added later.
         overwrite: replace what other settings left there.
         rules: frames, size and cameras of the logs. distances_m: lateral distances, each to both sides.
 
     Raises:
-        UsageError: an unknown method, a malformed variant, or ``out`` holds logs of other settings. Whatever a verb raises.
+        UsageError: an unknown method, a malformed variant, a setting that no row uses, or ``out`` holds logs of other settings. Whatever
+            a verb raises.
     """
-    rows = rows_of(config)
+    rows = rows_of(config, preset)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
     refuse_foreign(Path(out), _PAGES, _is_own, lambda entry: entry.name.isdigit())
     seeds = city_logs.LISTS[config.list][: config.logs]
     shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
-    painted = SynthesizeConfig(
-        cameras=("front",),
-        shifts_m=shifts,
-        model=config.model,
-        precision=config.precision,
-        processes=1,
-        seed=config.seed,
-    )
-    painted = on_device(painted, config.device)
-    renders, usual = mdm_files.uses_renders(config.model), usual_fit(config)
+    painted = replace(generator_of(config), cameras=("front",), shifts_m=shifts)
+    renders = mdm_files.uses_renders(config.model)
+    generates = any(row.name == DIFFUSION for row in rows)
+    refuse_unfit(config, preset, [row.fit for row in rows if row.fit is not None], [painted] * generates, renders)
     jobs = [
-        LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, usual, painted, renders, config.videos, overwrite)
-        for seed in seeds
-    ]  # fmt: skip
+        LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, config, painted, renders, overwrite) for seed in seeds
+    ]
     logs = each_log(make_log, jobs, [str(seed) for seed in seeds], at_once(config))
-    document = shift_tables.document(logs, rows_as_values(rows), list(distances_m), settings_of(config, rules))
+    document = shift_tables.document(
+        logs, rows_as_values(rows), list(distances_m), {**settings_of(config, rules), **chain_settings(config, preset)}
+    )
     store.write_json(Path(out) / "bench.json", document)
     store.write_text(Path(out) / "bench.md", shift_tables.markdown(document))
     store.write_text(Path(out) / "page.html", shift_page.page(document))
@@ -155,16 +156,11 @@ def _is_own(document: Mapping[str, Any]) -> bool:
 # ---- what is compared ----
 
 
-def usual_fit(config: BenchConfig) -> FitConfig:
-    """The settings of fits, as ``mudg run`` takes them for the whole chain."""
-    return FitConfig(method=WITH, iterations=config.iterations, seed=config.seed, device=config.device)
-
-
-def rows_of(config: BenchConfig) -> tuple[Row, ...]:
+def rows_of(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
     """The methods, ablation rows and variants of a configuration, in the order of the tables.
 
     Raises:
-        UsageError: an unknown method, or a malformed or repeated variant.
+        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant.
     """
     known = (FILL, "gs3d", WITHOUT, LONGER, *PUBLISHED, DIFFUSION, WITH)
     wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
@@ -176,7 +172,7 @@ def rows_of(config: BenchConfig) -> tuple[Row, ...]:
     rows = [
         Row(
             name, titles.get(name, title_of(name)),
-            None if name in GENERATED else configuration.load(FitConfig, plain, overrides={"method": methods.get(name, name)}),
+            None if name in GENERATED else method_fit(plain, methods.get(name, name), preset),
         )
         for name in known
         if name in wanted
@@ -220,7 +216,7 @@ def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
     """What was asked for, for JSON."""
     return {
         "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
-        "renders": mdm_files.uses_renders(config.model), "continued_share": CONTINUED_SHARE,
+        "renders": mdm_files.uses_renders(config.model),
         "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
         "held_out_every": TEST_EVERY, "ablation": config.ablation,
     }  # fmt: skip
@@ -236,11 +232,11 @@ def make_log(job: LogJob) -> dict[str, Any]:
     scene = out / "scene"
     made(lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o), job.overwrite)
     fused, painted = out / "fuse", out / "synthesize"
-    made(lambda o: fuse.run(FuseConfig(), scene, fused, overwrite=o), job.overwrite)
+    made(lambda o: fuse.run(job.config.fuse, scene, fused, overwrite=o), job.overwrite)
     if any(row.name == DIFFUSION or (row.fit is not None and learns_virtual(row.fit)) for row in job.rows):
         first = job.fits.first() if job.renders else None
         made(lambda o: synthesize.run(job.synthesize, scene, fused, painted, fitted=first, overwrite=o), job.overwrite)
-    drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False, device=job.usual.device)
+    drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False, device=job.config.device)
     paths = render.trajectories(read_scene(scene), drawn)
     truth = out / "truth"
     made(lambda o: score_truth.write_truth(scene, paths, truth, overwrite=o), job.overwrite)
@@ -250,7 +246,7 @@ def make_log(job: LogJob) -> dict[str, Any]:
         views[row.name] = _views_of(job, row, drawn, paths)
         found[row.name] = _scores_of(job, row, views[row.name])
     films: list[str] = []
-    if job.videos:
+    if job.config.videos:
         shown = {"truth": truth, **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN}}
         # With another method the old films are out of date, whatever was asked.
         made(lambda o: shift_page.film(shown, paths, out / "film", overwrite=o), overwrite=True)
@@ -281,7 +277,7 @@ def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajec
 
 def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
     """A method's values by distance, from a score of its own against the common truth."""
-    settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS, device=job.usual.device)
+    settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS, device=job.config.device)
     scene, truth, scored = job.out / "scene", job.out / "truth", job.out / "score" / row.name
     made(lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o), job.overwrite)
     return {

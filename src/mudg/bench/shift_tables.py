@@ -165,10 +165,17 @@ def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[
 # ---- text ----
 
 
+def virtual_fits_of(settings: Mapping[str, Any]) -> str:
+    """How many iterations fits under virtual views have, as part of a sentence."""
+    share = settings["continued_share"]
+    more = "under virtual views {:g} times as many more after the fit on recorded views"
+    return more.format(share) if share else "those under virtual views too, from nothing"
+
+
 def further_of(settings: Mapping[str, Any]) -> str:
     """What fits under virtual views do, as part of a sentence."""
-    seen = " with renders of that fit" if settings.get("renders") else " without renders"
-    return f"under virtual views half as many more after the fit on recorded views; generated{seen}"
+    seen = " with renders of the fit on recorded views" if settings["renders"] else " without renders"
+    return f"{virtual_fits_of(settings)}; generated{seen}"
 
 
 def markdown(doc: Mapping[str, Any]) -> str:

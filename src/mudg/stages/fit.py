@@ -16,6 +16,7 @@ With ``start`` it goes on with a finished fit (``fitting/continued.py``).
 from __future__ import annotations
 
 import contextlib
+import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -340,7 +341,8 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             if step % 20 == 0 or step == config.iterations or densified:
                 state.last = _progress(state, views[0], *learnt[0])
                 folder.log(step=step, view=views[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
-                bar.update(f"psnr {state.last['psnr']:.1f}, {len(state.model.table)} Gaussians")
+                shown = f"psnr {state.last['psnr']:.1f}, " if "psnr" in state.last else ""
+                bar.update(f"{shown}{len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
                 write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
             if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
@@ -562,7 +564,8 @@ def _progress(state: FitState, view: TrainView, render: LearntPicture, terms: Ma
         rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
         psnr = metrics.psnr(rgb, view.rgb, view.mask)
         values = torch.stack(list(terms.values())).tolist()
-    return {"psnr": round(min(psnr, 99.0), 3), **{f"loss_{name}": round(value, 6) for name, value in zip(terms, values)}}
+    seen = {} if math.isnan(psnr) else {"psnr": round(min(psnr, 99.0), 3)}  # no pixel of a generated view may count
+    return {**seen, **{f"loss_{name}": round(value, 6) for name, value in zip(terms, values)}}
 
 
 def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:

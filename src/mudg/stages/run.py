@@ -18,7 +18,7 @@ from mudg.base.memory import in_words
 from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
-from mudg.stages.config import FitConfig, RunConfig, with_device
+from mudg.stages.config import FitConfig, RunConfig, SynthesizeConfig, with_device
 from mudg.stages.config.presets import NO_MODEL
 
 CITY = "city"
@@ -74,7 +74,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     if str(source) != CITY and not Path(source).exists():
         raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
     _refuse_overlap(config, source, out)
-    _refuse_missing(config)
+    refuse_missing(config.synthesize, config.fit)
     torch.set_num_threads(native.default_threads())
     ledger = _Ledger.open(out, config, str(source), overwrite)
     config = with_device(config)
@@ -113,25 +113,29 @@ def _write_viewer(out: Path) -> Path:
     return view.run_page(PageConfig(), out, out / VIEWER, report="report.html", overwrite=True)["page"]
 
 
-def _refuse_missing(config: RunConfig) -> None:
+def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
     """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion model. Before
-    anything is written: the first of these is needed only after a fit."""
+    anything is written: the first of these is needed only after a fit.
+
+    Args:
+        flag: what names the diffusion model on this command line.
+    """
     from mudg.models.mdm.files import read_description
     from mudg.models.published.files import is_published
 
-    if config.synthesize.model == NO_MODEL:
+    if generator.model == NO_MODEL:
         raise UsageError(
-            "the preset paper needs a published-type diffusion model, which mudg does not ship", where="--synthesize.model",
+            "the preset paper needs a published-type diffusion model, which mudg does not ship", where=flag,
             expected="a folder written by mudg convert", remedy="convert a checkpoint that you have (docs/published.md)",
         )  # fmt: skip
-    if config.fit.virtual.perception == "lpips" and not config.fit.virtual.lpips_weights:
+    if fit.virtual.perception == "lpips" and not fit.virtual.lpips_weights:
         raise UsageError(
             "LPIPS needs a weight file, which mudg does not ship", where="--fit.virtual.lpips-weights", expected="a safetensors file",
             remedy="give one, or --fit.virtual.perception filters",
         )  # fmt: skip
-    read_description(config.synthesize.model)
-    if config.synthesize.guidance is not None and not is_published(config.synthesize.model):
-        raise UsageError("guidance applies to published-type models only", where="--synthesize.model", got=config.synthesize.model,
+    read_description(generator.model)
+    if generator.guidance is not None and not is_published(generator.model):
+        raise UsageError("guidance applies to published-type models only", where=flag, got=generator.model,
                          expected="a folder written by mudg convert")  # fmt: skip
 
 

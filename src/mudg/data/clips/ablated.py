@@ -23,7 +23,8 @@ from mudg.data.clips.weathered import InWeather, WeatheredPoints, weathered
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
 without recorded images and renders. concat: points and that image, without anything warped by depth, and without renders. repair:
-renders of a fit and that image, without anything measured."""
+renders of a fit and that image, without anything measured. Of published-type models reference and points leave out the other; concat
+shows the image in frame 0, beside the points, and not in the image tokens."""
 
 
 COVERED = 0.5
@@ -67,6 +68,13 @@ def conditions_of(
         return (small, fine) if how is None or rules.published else in_weather(small, fine, how)
     if parts == "repair":
         return _of_renders(sources, views, kept)
+    if rules.published:
+        whole = build_conditions(cloud, tracks, views, recorded, rules, kept)[0]
+        if parts == "reference":
+            whole = replace(whole, valid=torch.zeros_like(whole.valid))
+        else:
+            whole = replace(whole, reference_in="frame" if parts == "concat" else "nowhere")
+        return whole, whole
     points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)
     if parts == "points":
         return points

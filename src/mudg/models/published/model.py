@@ -256,18 +256,24 @@ class PublishedMDM(nn.Module):
         if self.config.missing_is_zero:
             color, depth = color * valid, depth * valid
         seen = valid
+        in_frame, in_tokens = (
+            torch.tensor([c.reference_in in uses for c in batch], device=self.device)[:, None, None, None]
+            for uses in (("tokens_and_frame", "frame"), ("tokens_and_frame",))
+        )
+        first, first_seen = torch.where(in_frame, reference, color[:, 0]), torch.where(in_frame, 1.0, seen[:, 0])
         if known is not None:
             color = torch.cat([known.to(color).expand(len(color), -1, -1, -1, -1), color[:, len(known) :]], 1)
             seen = torch.cat([torch.ones_like(seen[:, : len(known)]), seen[:, len(known) :]], 1)
-        color, bare = torch.cat([reference[:, None], color[:, 1:]], 1), color[:, :1]
-        seen = torch.cat([torch.ones_like(seen[:, :1]), seen[:, 1:]], 1)
+        color, bare = torch.cat([first[:, None], color[:, 1:]], 1), color[:, :1]
+        seen = torch.cat([first_seen[:, None], seen[:, 1:]], 1)
         generator = self._posterior(generator)
         planes = torch.cat(
             [self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2
         )
-        features = self._features(torch.cat([reference * 2 - 1, torch.zeros_like(reference[:1])]))
-        first = self._encode(bare * 2 - 1, generator)[:, 0] if points_first else None
-        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen), first)
+        shown = torch.where(in_tokens, reference * 2 - 1, 0.0)
+        features = self._features(torch.cat([shown, torch.zeros_like(reference[:1])]))
+        points_alone = self._encode(bare * 2 - 1, generator)[:, 0] if points_first else None
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen), points_alone)
 
     def _features(self, images: Tensor) -> Tensor:
         """What the image tower, which lies on the CPU if `split` says so, makes of images on the model's device."""

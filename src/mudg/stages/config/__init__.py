@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mudg.stages.config.adapt import AdaptConfig
     from mudg.stages.config.batch import BatchConfig
-    from mudg.stages.config.bench import BenchConfig
+    from mudg.stages.config.bench import BenchConfig, BenchOwn
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.edit import EditConfig
     from mudg.stages.config.export import ExportConfig, ImportConfig
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mudg.stages.config.harmonize import HarmonizeConfig
     from mudg.stages.config.learn import LearnConfig
     from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
-    from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, chosen_preset, run_preset
+    from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, bench_preset, chosen_preset, run_preset
     from mudg.stages.config.run import RunConfig, on_device, with_device, with_lines, with_seed
     from mudg.stages.config.synthesize import SynthesizeConfig
     from mudg.stages.config.view import PageConfig, ViewConfig
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BatchConfig": "mudg.stages.config.batch",
     "BenchConfig": "mudg.stages.config.bench",
+    "BenchOwn": "mudg.stages.config.bench",
     "ConvertConfig": "mudg.stages.config.convert",
     "EditConfig": "mudg.stages.config.edit",
     "ExportConfig": "mudg.stages.config.export",
@@ -43,6 +44,7 @@ _HOMES = {
     "DEMO_CITY": "mudg.stages.config.presets",
     "PRESETS": "mudg.stages.config.presets",
     "PresetName": "mudg.stages.config.presets",
+    "bench_preset": "mudg.stages.config.presets",
     "chosen_preset": "mudg.stages.config.presets",
     "RunConfig": "mudg.stages.config.run",
     "run_preset": "mudg.stages.config.presets",
@@ -64,6 +66,7 @@ __all__ = [
     "AnnotateConfig",
     "BatchConfig",
     "BenchConfig",
+    "BenchOwn",
     "ConvertConfig",
     "EditConfig",
     "ExportConfig",
@@ -80,6 +83,7 @@ __all__ = [
     "ScoreConfig",
     "SynthesizeConfig",
     "ViewConfig",
+    "bench_preset",
     "chosen_preset",
     "on_device",
     "run_preset",

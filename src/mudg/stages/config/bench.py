@@ -10,18 +10,21 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base.config import STRICT
 from mudg.base.devices import DeviceName
+from mudg.stages.config.fit import FitConfig
+from mudg.stages.config.prepare import FuseConfig
+from mudg.stages.config.synthesize import SynthesizeConfig
 from mudg.stages.config.views import ScoreConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class BenchConfig:
-    """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on generated cities
-    against exact ground truth; complete methods on real logs; or fill a table of a paper."""
+class BenchOwn:
+    """The settings of ``mudg bench`` without those of the steps that it takes."""
 
     MOVED: ClassVar[Mapping[str, str | None]] = {"ablation_steps": None, "ablation_cities": None}
 
     model: str = "embedded"
-    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn."""
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or
+    convert."""
     cities: Literal["reported", "development"] = "reported"
     """mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen."""
     count: int = Field(default=6, ge=1, le=6)
@@ -31,7 +34,8 @@ class BenchConfig:
     """mdm: numbers of denoising steps to compare; each is measured on its own."""
     sampler: Literal["ddim", "dpm_solver"] = "ddim"
     """mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
-    deterministic, for many steps. Both cost one network pass per step."""
+    deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and
+    likewise steps and eta."""
     eta: float | None = Field(default=None, ge=0, le=1)
     """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
@@ -54,6 +58,9 @@ class BenchConfig:
     in its input. paper: any of these of shift, and freevs; with the default, all of them."""
     iterations: int = Field(default=1000, ge=1)
     """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
+    continue_fit: bool = True
+    """shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as
+    published."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact
     views instead of generated ones. real: add the rows without adaptation and without renders."""
@@ -71,8 +78,6 @@ class BenchConfig:
     """paper: the table to fill (docs/paper_tables.md)."""
     freevs_model: str = ""
     """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers)."""
-    score: ScoreConfig = Field(default_factory=ScoreConfig)
-    """paper: how every row is scored; files of weights are given here."""
     protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
     """real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
     shown: tuple[str, ...] = ()
@@ -88,3 +93,19 @@ class BenchConfig:
     """poses, edit: optimisation steps of every fit."""
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class BenchConfig(BenchOwn):
+    """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on generated cities
+    against exact ground truth; complete methods on real logs; or fill a table of a paper."""
+
+    fuse: FuseConfig = Field(default_factory=FuseConfig)
+    """shift, real, paper: how the clouds of every log are made."""
+    synthesize: SynthesizeConfig = Field(default_factory=SynthesizeConfig)
+    """shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are
+    generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from)."""
+    fit: FitConfig = Field(default_factory=FitConfig)
+    """shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
+    score: ScoreConfig = Field(default_factory=ScoreConfig)
+    """paper: how every row is scored; files of weights are given here."""

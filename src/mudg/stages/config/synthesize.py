@@ -39,9 +39,10 @@ class SynthesizeConfig:
     """Samples per clip. The first one is kept; the spread of all of them lowers the confidence. Time grows with this number."""
     condition: Literal["full", "reference", "points", "concat", "freevs", "repair"] = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points:
-    LiDAR points alone. concat: both, without images warped by depth. The shipped models were trained on whole conditions; published-type
-    models take no other. freevs: the condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair:
-    renders of `--fitted` and the nearest recorded image, without points; gives colour alone."""
+    LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image
+    tokens). The shipped models were trained on whole conditions. freevs: the condition of FreeVS, for models learned with
+    `--data.condition freevs`; gives colour alone. repair: renders of `--fitted` and the nearest recorded image, without points; gives
+    colour alone."""
     given_classes: bool = True
     """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
     label_confidence: float = Field(default=0.5, ge=0, le=1)

@@ -49,10 +49,14 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
     if repairs and not (fitted or published):
         raise UsageError("this condition is made of renders of a fitted scene", where="--condition", got="repair",
                          remedy="give the folder of a finished fit as --fitted")  # fmt: skip
-    if config.condition != "full" and (published or (fitted and not repairs)):
-        got = "a published-type model" if published else "--fitted: renders are left out of such a condition"
-        raise UsageError("parts of the condition cannot be switched off here", where="--condition", expected="full", got=got,
-                         remedy="leave out --condition" + ("" if published else " or --fitted"))  # fmt: skip
+    if published and config.condition in ("freevs", "repair"):
+        raise UsageError(
+            "a published-type model does not know this condition", where="--condition", expected="full, reference, points, concat",
+            got=config.condition, remedy="leave it out, or choose another --model",
+        )  # fmt: skip
+    if config.condition != "full" and fitted and not repairs:
+        raise UsageError("parts of the condition cannot be switched off here", where="--condition", expected="full",
+                         got="--fitted: renders are left out of such a condition", remedy="leave out --condition or --fitted")  # fmt: skip
     if published and config.offload and device.type == "cpu":
         raise UsageError("the image tower is on the CPU already", where="--offload", got="--device cpu", remedy="leave one of them out")
     if published:

@@ -1,0 +1,287 @@
+"""``mudg bench shift``, ``real`` and ``paper`` under presets and with a published-type model: what runs is what was asked for, and what is
+on record; settings that change nothing are refused."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_score_metrics import lpips_state
+from toy_published import write_tiny
+
+from mudg.base import config as configuration
+from mudg.base import store
+from mudg.base.errors import UsageError
+from mudg.bench import run as bench
+from mudg.bench import shift
+from mudg.bench.chain import LONGER, method_fit
+from mudg.bench.paper_tables import RECORDED, TABLES
+from mudg.bench.shift import rows_of
+from mudg.cli import parse
+from mudg.data.city.config import CityConfig
+from mudg.data.city.logs import LogRules
+from mudg.data.clips.ablated import ConditionSources, conditions_of
+from mudg.data.clips.condition import ConditionRules
+from mudg.data.cloudfile import read_fused
+from mudg.data.scene import read_image, read_scene
+from mudg.models.published import files as published_files
+from mudg.models.published.video_unet import VideoUNet
+from mudg.stages import fuse, ingest
+from mudg.stages.config import (
+    BenchConfig,
+    FitConfig,
+    FuseConfig,
+    IngestConfig,
+    SynthesizeConfig,
+    bench_preset,
+    run_preset,
+)
+from mudg.stages.synthesize import recorded_images
+
+MODALITIES = 3
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """Folder of a published-type toy model (windows of 4 frames), and a file of LPIPS weights."""
+    folder = tmp_path_factory.mktemp("published")
+    store.write_safetensors(folder / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()})
+    return write_tiny(folder), folder / "lpips.safetensors"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A log of six frames of one camera."""
+    city = CityConfig(n_frames=6, width=64, height=48, cameras=("front",), seed=2100000, lidar_azimuth_step_deg=1.0)
+    out = tmp_path_factory.mktemp("logs") / "city"
+    return ingest.run(IngestConfig(test_every=0, contact_sheet=False, city=city), ingest.CITY, out)
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Videos that went through the denoising network, one number per call."""
+    seen = []
+    forward = VideoUNet.forward
+    monkeypatch.setattr(VideoUNet, "forward", lambda net, x, *rest: (seen.append(len(x)), forward(net, x, *rest))[1])
+    return seen
+
+
+def published_set_up(weights, *flags):
+    """What ``mudg bench`` makes of ``--preset paper`` with few steps, and windows that share two frames."""
+    words = ["bench", "paper", "--out", "unused", "--preset", "paper", "--model", str(weights[0]), "--synthesize.steps", "3",
+             "--synthesize.overlap", "2", "--iterations", "6", "--processes", "1", "--no-videos", *flags]  # fmt: skip
+    return parse(words).settings
+
+
+def videos(trajectories, guided=True):
+    """Videos through the network: windows of 4 that share 2 of 6 frames are two; with guidance each goes through twice."""
+    return 3 * MODALITIES * (2 if guided else 1) * 2 * trajectories
+
+
+# ---- settings ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_default_preset_changes_nothing():
+    assert bench_preset() == BenchConfig()
+
+
+@pytest.mark.parametrize("preset", ["fast", "quality", "paper"])
+def test_a_preset_of_a_benchmark_is_that_of_a_run(preset):
+    benchmark, run = bench_preset(preset), run_preset(preset)
+    assert (benchmark.model, benchmark.iterations) == (run.synthesize.model, run.fit.iterations)
+    assert (benchmark.fuse, benchmark.continue_fit) == (run.fuse, run.continue_fit)
+    for mine, theirs, own in ((benchmark.synthesize, run.synthesize, {"model", "cameras"}), (benchmark.fit, run.fit, {"iterations"})):
+        assert {n: v for n, v in configuration.to_dict(mine).items() if n not in own} == {
+            n: v for n, v in configuration.to_dict(theirs).items() if n not in own
+        }
+
+
+def test_every_setting_has_its_benchmarks():
+    assert set(bench.USED) == {field.name for field in dataclasses.fields(BenchConfig)}
+    for name, users in bench.USED.items():
+        assert set(users) <= {*bench.BENCHES, *bench.CHAINS, bench.RUNS}, name
+
+
+REFUSED = [
+    ("paper", ["--steps", "50"], "--steps", "--synthesize.steps"),
+    ("shift", ["--eta", "0.5"], "--eta", "--synthesize.eta"),
+    ("real", ["--sampler", "dpm_solver"], "--sampler", "--synthesize.sampler"),
+    ("paper", ["--cities", "development"], "--cities", "leave it out"),
+    ("paper", ["--ablation"], "--ablation", "leave it out"),
+    ("paper", ["--variant", "a=sh_degree:1"], "--variant", "leave it out"),
+    ("paper", ["--protocols", "gap"], "--protocols", "leave it out"),
+    ("real", ["--no-videos"], "--videos", "leave it out"),
+    ("real", ["--table", "mudg3"], "--table", "leave it out"),
+    ("real", ["--logs", "2"], "--logs", "leave it out"),
+    ("shift", ["--frames", "0:4"], "--frames", "leave it out"),
+    ("shift", ["--score.width-px", "64"], "--score.width-px", "leave it out"),
+    ("mdm", ["--iterations", "5"], "--iterations", "leave it out"),
+    ("mdm", ["--synthesize.steps", "5"], "--synthesize.steps", "leave it out"),
+    ("mdm", ["--preset", "fast"], "--preset", "leave it out"),
+    ("poses", ["--model", "embedded-tiny"], "--model", "leave it out"),
+    ("edit", ["--model", "embedded-tiny"], "--model", "leave it out"),
+    ("edit", ["--precision", "float32"], "--precision", "leave it out"),
+    ("shift", ["--fit.iterations", "5"], "--fit.iterations", "--iterations"),
+    ("shift", ["--fit.method", "gs3d"], "--fit.method", "--methods"),
+    ("shift", ["--synthesize.model", "embedded-tiny"], "--synthesize.model", "--model"),
+    ("shift", ["--synthesize.shifts-m", "1"], "--synthesize.shifts-m", "leave it out"),
+    ("paper", ["--synthesize.condition", "points"], "--synthesize.condition", "leave it out"),
+    ("paper", ["--score.perceptual-views", "3"], "--score.perceptual-views", "leave it out"),
+    ("shift", ["--methods", "gs3d", "--synthesize.steps", "4"], "--synthesize.steps", "leave it out"),
+    ("shift", ["--methods", "gs3d", "--fit.virtual.probability", "0.3"], "--fit.virtual.probability", "leave it out"),
+    ("shift", ["--methods", "mudg_s", LONGER, "--no-continue-fit"], "--methods", "leave it out"),
+    ("shift", ["--methods", "difix", "--model", "embedded-tiny"], "--methods", "leave difix out"),
+    ("shift", ["--synthesize.guidance", "7.5"], "--model", ""),
+    ("shift", ["--preset", "paper"], "--model", "convert a checkpoint"),
+    ("shift", ["--synthesize.compiled"], "--compiled", "leave it out"),
+    ("shift", ["--methods", "pvg", "--fit.poses.learn"], "poses.learn", "leave the setting out"),
+    ("paper", ["--table", "mudg3", "--freevs-model", "x"], "--freevs-model", "leave it out"),
+    ("paper", ["--methods", "mudg_r", "--freevs-model", "x"], "--freevs-model", "leave it out"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "words", "where", "remedy"), REFUSED, ids=[f"{name} {' '.join(words)}" for name, words, *_ in REFUSED])
+def test_a_setting_that_would_change_nothing_is_refused_before_anything_is_written(tmp_path, name, words, where, remedy):
+    sources = ("city:development",) if name == "paper" else ()
+    args = parse(["bench", name, *sources, "--out", str(tmp_path / "out"), *words])
+    with pytest.raises(UsageError) as caught:
+        bench.run(name, args.settings, args.out, sources=args.sources, preset=args.preset)
+    assert caught.value.where == where and remedy in (caught.value.remedy or "")
+    assert not (tmp_path / "out").exists()
+
+
+def test_recorded_logs_are_not_counted(scene, tmp_path):
+    with pytest.raises(UsageError, match="counted by naming them"):
+        bench.run("paper", BenchConfig(logs=2), tmp_path / "out", sources=(scene,))
+
+
+def test_a_table_whose_rows_fit_nothing_takes_no_settings_of_fits(weights, tmp_path):
+    config = dataclasses.replace(bench_preset("paper"), model=str(weights[0]), table="mudg2", iterations=7)
+    with pytest.raises(UsageError, match="change nothing") as caught:
+        bench.run("paper", config, tmp_path / "out", sources=("city:development",), preset="paper")
+    assert caught.value.where == "--iterations" and not (tmp_path / "out").exists()
+
+
+def test_a_method_for_comparison_keeps_what_the_preset_sets_and_it_does_not_know():
+    fits = {row.name: row.fit for row in rows_of(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")}
+    assert (fits["mudg_s"].poses.learn, fits["pvg"].poses.learn) == (True, False)
+    assert fits["pvg"].start == fits["mudg_s"].start and fits["pvg"].iterations == fits["mudg_s"].iterations == 30_000
+    with pytest.raises(UsageError, match="knows nothing of it"):
+        method_fit(FitConfig(poses={"learn": True}), "pvg", "default")
+
+
+# ---- the published model through all three -----------------------------------------------------------------------------
+
+
+def test_table_2_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
+    model, _ = weights
+    words = ("bench paper city:development --preset paper --table mudg2 --logs 1 --frames 0:6 --resolution 64x48 --processes 1 --no-videos "
+             f"--synthesize.steps 3 --synthesize.overlap 2 --model {model} --out {tmp_path / 'out'}").split()  # fmt: skip
+    args = parse(words)
+    out = bench.run("paper", args.settings, args.out, sources=args.sources, preset=args.preset)
+    assert sum(passes) == videos(len(TABLES["mudg2"].rows))
+    document = store.read_json(out / "bench.json")
+    asked = document["settings"]["synthesize"]
+    assert document["settings"]["preset"] == "paper" and document["settings"]["renders"] is False
+    assert {name: asked[name] for name in ("steps", "overlap", "eta", "guidance", "guidance_rescale", "align_depth", "full_size")} == {
+        "steps": 3, "overlap": 2, "eta": 1.0, "guidance": 7.5, "guidance_rescale": 0.7, "align_depth": False, "full_size": False,
+    }  # fmt: skip
+    log = out / document["logs"][0]["log"]
+    assert not (log / "fit").exists()
+    for row in TABLES["mudg2"].rows:
+        ran = configuration.load(SynthesizeConfig, yaml_path=log / "generated" / f"{row.name}-{RECORDED}" / "run.yaml")
+        assert ran.condition == row.changes.get("condition", "full")
+        assert {name: getattr(ran, name) for name in asked if name != "device"} == {n: v for n, v in asked.items() if n != "device"}
+    psnr = [document["cells"][row.name][RECORDED]["psnr"]["mean"] for row in TABLES["mudg2"].rows]
+    assert len({round(value, 6) for value in psnr}) == len(psnr)  # every condition gives other views
+
+
+@pytest.mark.slow
+def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
+    config = published_set_up(weights, "--table", "mudg3", "--logs", "1", "--frames", "0:6", "--resolution", "64x48",
+                              "--synthesize.width-px", "48", "--fit.virtual.lpips-weights", str(weights[1]))  # fmt: skip
+    out = bench.run("paper", config, tmp_path / "out", sources=("city:development",), preset="paper")
+    assert sum(passes) == videos(2)  # 2 m to both sides, once for all rows
+    document = store.read_json(out / "bench.json")
+    log = out / document["logs"][0]["log"]
+    for row in TABLES["mudg3"].rows:
+        state = store.read_json(log / "fit" / row.name / "run.json")
+        assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]  # from nothing, with all steps
+        ran = configuration.load(FitConfig, yaml_path=log / "fit" / row.name / "run.yaml")
+        assert (ran.loss.semantic_weight, ran.virtual.beside, ran.virtual.perception, ran.sh_degree) == (0.0, False, "lpips", 3)
+        assert math.isfinite(document["cells"][row.name][RECORDED]["psnr"]["mean"])
+    recorded = document["settings"]["fit"]
+    assert (recorded["iterations"], recorded["loss"]["object_weight"], recorded["virtual"]["probability"]) == (6, 0.1, 0.2)
+    assert document["settings"]["fuse"]["box_growth_m"] == 0.0 and document["settings"]["continued_share"] is None
+    fused = configuration.load(FuseConfig, yaml_path=log / "fuse" / "run.yaml")
+    assert (fused.box_growth_m, fused.occlusion_test) == (0.0, False)
+
+
+def test_shift_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
+    config = published_set_up(weights, "--logs", "1", "--methods", "mudg_r", "mudg_s", "--fit.virtual.perception", "filters")
+    rules = LogRules(frames=6, width=64, height=48, cameras=("front",))
+    out = shift.run(config, tmp_path / "out", preset="paper", rules=rules, distances_m=(3.0,))
+    assert sum(passes) == videos(2)
+    document = store.read_json(out / "bench.json")
+    log = out / str(document["logs"][0]["log"])
+    assert not (log / "fit" / "street_gaussians").exists()  # nothing goes on with it
+    assert store.read_json(log / "fit" / "mudg_s" / "run.json")["summary"]["steps"] == 6
+    assert document["settings"]["synthesize"]["steps"] == 3 and document["settings"]["fit"]["sh_degree"] == 3
+    for method in ("mudg_r", "mudg_s"):
+        assert math.isfinite(document["pooled"][method]["3"]["psnr"]["mean"])
+
+
+def test_real_runs_with_a_published_type_model_as_recorded(weights, scene, tmp_path, passes):
+    config = published_set_up(
+        weights, "--synthesize.shifts-m", "2", "--synthesize.guidance", "1", "--fit.virtual.perception", "filters"
+    )
+    config = dataclasses.replace(config, videos=True, methods=("mudg_r", "mudg_s"), protocols=("lidar",))
+    out = bench.run("real", config, tmp_path / "out", sources=(scene,), preset="paper")
+    generated = 5 + 1  # the scored places (recorded path, 2 and 3 m to both sides), and the views that the fit learns from
+    assert sum(passes) == videos(generated, guided=False)
+    document = store.read_json(out / "bench.json")
+    assert document["settings"]["virtual_shifts_m"] == [2.0] and document["settings"]["synthesize"]["guidance"] == 1.0
+    use = document["logs"][0]["diffusion"]["all"]["mudg_s"]
+    assert use["sees"] == "points" and "does not use renders" in use["note"]
+    assert isinstance(document["protocols"]["lidar"]["pooled"]["mudg_s"]["abs_rel_static"], float)
+    state = store.read_json(out / "city" / "all" / "fit" / "mudg_s" / "run.json")
+    assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]
+
+
+# ---- parts of a published-type model's condition ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sources(scene, tmp_path_factory):
+    """What conditions are made of, and the same with other points and with other recorded images."""
+    loaded = read_scene(scene)
+    cloud = read_fused(fuse.run(FuseConfig(), scene, tmp_path_factory.mktemp("cloud") / "fuse"))
+    photos = recorded_images(loaded, SynthesizeConfig())
+    given = ConditionSources(cloud, loaded.tracks, photos, ConditionRules(32, 32, 64, 48, published=True))
+    dark = dataclasses.replace(cloud.static, rgb=255 - np.asarray(cloud.static.rgb), xyz=cloud.static.xyz * 1.1)
+    other_points = dataclasses.replace(given, cloud=dataclasses.replace(cloud, static=dark))
+    other_images = dataclasses.replace(given, recorded=[dataclasses.replace(photo, rgb=255 - photo.rgb) for photo in photos])
+    assert read_image(loaded, loaded.frames[0]).shape == (48, 64, 3)
+    return [frame.view for frame in loaded.frames[:4]], given, other_points, other_images
+
+
+@pytest.mark.parametrize(
+    ("parts", "points", "tokens", "frame"),
+    [("full", True, True, True), ("reference", False, True, True), ("points", True, False, False), ("concat", True, False, True)],
+)
+def test_a_part_that_is_switched_off_does_not_reach_a_published_type_network(weights, sources, parts, points, tokens, frame):
+    model = published_files.load(weights[0])
+    views, *all_sources = sources
+
+    def latents(given):
+        condition = conditions_of(given, parts, views, {})[0]
+        return model.encode_condition(condition, torch.Generator().manual_seed(0))
+
+    usual, other_points, other_images = map(latents, all_sources)
+    assert torch.equal(usual.planes[:, 1:], other_points.planes[:, 1:]) != points
+    assert torch.equal(usual.planes[:, 1:], other_images.planes[:, 1:])
+    assert torch.equal(usual.planes[:, 0], other_images.planes[:, 0]) != frame
+    assert torch.equal(usual.features, other_images.features) != tokens
+    assert torch.equal(usual.features, usual.grey) != tokens
+    assert torch.equal(usual.features, other_points.features)

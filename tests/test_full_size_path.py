@@ -1,0 +1,104 @@
+"""The path of the full-size model, from a published checkpoint to a table of the paper, on toys: one command line after another."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from test_score_metrics import lpips_state
+from toy_published import TINY, tiny_checkpoint
+
+from mudg.base import store
+from mudg.data.observations import list_observation_sets, read_observations
+from mudg.models.published import files as published_files
+from mudg.stages.config import PRESETS
+
+TOY = "import sys; from toy_published import TINY; from mudg.stages import convert; convert.PublishedConfig = lambda: TINY\n"
+"""Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""
+MAIN = "from mudg.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+OWN = {"synthesize.model", "fit.iterations", "fit.virtual.lpips_weights"}
+"""What the command line of the table gives itself."""
+
+
+@pytest.fixture
+def mudg(tmp_path):
+    """A function that runs one command line below a folder, and returns its exit code and what it said."""
+    tests = str(Path(__file__).parent)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, *(path for path in sys.path if path)])}
+
+    def run(line, before=""):
+        done = subprocess.run(
+            [sys.executable, "-c", before + MAIN, *line.split()], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900
+        )
+        return done.returncode, done.stderr + done.stdout
+
+    return run
+
+
+def done(result):
+    code, words = result
+    assert code == 0, words
+
+
+@pytest.mark.slow
+def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
+    torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512-mdm-checkpoint.ckpt")
+    store.write_safetensors(tmp_path / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()})
+    city = "--city.n-frames 6 --city.width 64 --city.height 48 --city.cameras front --city.lidar-azimuth-step-deg 1"
+    done(mudg(f"ingest city log/scene {city}"))
+    done(mudg("fuse log/scene --out log/fuse"))
+
+    done(mudg("convert 512-mdm-checkpoint.ckpt --to models/start --dtype bfloat16", TOY))
+    start = published_files.load(tmp_path / "models" / "start")
+    assert (start.config.width, start.config.height) == (512, 320) and start.config.net == TINY.net
+
+    training = (
+        "--data.scenes log --data.window 4 --data.stride 2 --data.held-out-every 0 --data.no-augment --steps 1 --score.every 100 "
+        "--optimizer.batch-frames 4 --optimizer.full-window-share 1 --optimizer.lr 1e-5 --compute.workers 0 --precision float32"
+    )
+    done(mudg(f"learn --start models/start --data.width 32 --data.height 32 {training} --out one"))
+    done(mudg(f"learn --start one/model --data.width 36 --data.height 32 --frozen temporal_transformers {training} --out two"))
+    one, two = (published_files.load(tmp_path / name / "model") for name in ("one", "two"))
+    assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
+    kept, before, after = two.temporal_parameters("transformers"), one.trained_part().state_dict(), two.trained_part().state_dict()
+    assert {name for name in before if torch.equal(before[name], after[name])} == kept
+
+    code, words = mudg("adapt log/scene --fused log/fuse --fitted log/fuse --model two/model --out adapted")
+    assert code in (2, 3) and "renders" in words and not (tmp_path / "adapted").exists()
+
+    done(mudg("synthesize log/scene --fused log/fuse --model two/model --steps 50 --overlap 2 --shifts-m 2 --no-full-size --out virtual"))
+    (views,) = list_observation_sets(tmp_path / "virtual").values()
+    seen = read_observations(views)
+    assert len(seen) == 6
+    for frame in (seen[n] for n in range(6)):
+        assert (frame.rgb.shape, frame.depth.shape, frame.semantics.shape) == ((3, 32, 36), (1, 32, 36), (32, 36))
+        assert bool(torch.isfinite(frame.rgb).all()) and float(frame.rgb.std()) > 0.01
+    assert [bool(seen[n].mask.any()) for n in range(6)] == [False] + [True] * 5  # frame 0 shows the recorded pose
+
+    done(mudg("fit log/scene --fused log/fuse --observations virtual --method mudg_s --iterations 10 --start.gaussians 500 --out fit"))
+    assert store.read_json(tmp_path / "fit" / "run.json")["summary"]["steps"] == 10
+
+    done(mudg("bench paper city:development --table mudg3 --preset paper --model two/model --fit.virtual.lpips-weights lpips.safetensors "
+              "--iterations 10 --logs 1 --frames 0:5 --resolution 64x48 --no-videos --processes 1 --out table"))  # fmt: skip
+    document = store.read_json(tmp_path / "table" / "bench.json")
+    for row in ("street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"):
+        assert document["cells"][row]["0"]["psnr"]["mean"] > 5.0
+    settings = document["settings"]
+    assert settings["preset"] == "paper" and settings["continued_share"] is None and settings["iterations"] == 10
+    (log,) = (tmp_path / "table" / entry["log"] for entry in document["logs"])
+    folders = {"fuse": "fuse", "fit": "fit/mudg_s", "synthesize": "virtual"}
+    ran = {group: yaml.safe_load((log / folder / "run.yaml").read_text()) for group, folder in folders.items()}
+    for name, value in PRESETS["paper"].items():
+        group, _, rest = name.partition(".")
+        if group in ran and name not in OWN:
+            for record in (settings[group], ran[group]):
+                for part in rest.split("."):
+                    record = record[part]
+                assert record == value, name
+    generated, virtual = settings["synthesize"], settings["fit"]["virtual"]
+    assert (generated["steps"], generated["guidance"], virtual["probability"]) == (50, 7.5, 0.2)
+    assert dataclasses.replace(two.config, width=1, height=1) == dataclasses.replace(start.config, width=1, height=1)
