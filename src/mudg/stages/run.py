@@ -19,7 +19,7 @@ from mudg.base.run_folder import is_temporary, refuse_overlap
 from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
 from mudg.stages.config import FitConfig, RunConfig, with_device
-from mudg.stages.config.presets import NO_MODEL
+from mudg.stages.config.presets import NO_MODEL, PRESETS
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -105,12 +105,15 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
 
 def _write_viewer(out: Path) -> Path:
-    """Write the page that shows the fitted scene in a browser."""
+    """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside it."""
+    from mudg.base.result_file import description_path
     from mudg.report.run_report import VIEWER
     from mudg.stages.config import PageConfig
     from mudg.stages.viewing import view
 
-    return view.run_page(PageConfig(), out, out / VIEWER, report="report.html", overwrite=True)["page"]
+    page = view.page_of(PageConfig(), view.find_shown(PageConfig(), out, None, None), report="report.html")
+    store.remove(description_path(out / VIEWER))
+    return view.write_page(page, out / VIEWER, (out / VIEWER).with_name(f"{Path(VIEWER).stem}_page"))["page"]
 
 
 def _refuse_missing(config: RunConfig) -> None:
@@ -164,9 +167,9 @@ def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Le
     if str(source) != CITY and _is_scene(source):
         scene = Path(source)
     else:
-        scene = ledger.timed(
-            Step("ingest", "scene", lambda: ingest.run(config.ingest, str(source), out / "scene", overwrite=overwrite))
-        )
+        of_preset = config.ingest.resolution == PRESETS["fast"]["ingest.resolution"]  # which is for logs: a city has a size of its own
+        settings = replace(config.ingest, resolution="") if str(source) == CITY and of_preset else config.ingest
+        scene = ledger.timed(Step("ingest", "scene", lambda: ingest.run(settings, str(source), out / "scene", overwrite=overwrite)))
     if not _has_semantics(scene):
         labelled = out / "annotate"
         return ledger.timed(
