@@ -449,8 +449,8 @@ def _drop_lock_of_the_dead(lock: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(lock: Path, what: Path) -> Iterator[None]:
-    """Hold a lock for this process alone, for ``what`` in messages.
+def locked(lock: Path, what: Path | None = None) -> Iterator[None]:
+    """Hold a lock for this process alone: that of a file ``what``, else of the folder in which the lock lies.
 
     Raises:
         ResourceError: another live process of this machine holds it.
