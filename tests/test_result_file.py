@@ -9,10 +9,13 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from faults import failing, in_child, killed, points
 from test_gallery import run_of
 from toy_fitted import write_toy_run
@@ -21,7 +24,9 @@ from mudg import FittedScene, cli
 from mudg.base import store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, take_lock
+from mudg.core.table import Table
 from mudg.stages.config import PageConfig
+from mudg.stages.fitting.storage import save_model
 from mudg.stages.viewing import view
 
 
@@ -193,6 +198,44 @@ def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatc
     (made["page"].parent / "index.html").write_text("altered")
     with pytest.raises(Exception, match="altered"):
         page(tmp_path / "x")
+
+
+# ---- any number of threads -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fit of 95,003 Gaussians: torch divides them among its threads, and rounds otherwise where a part does not fill a vector."""
+    root = tmp_path_factory.mktemp("crowd").resolve()
+    scene, _, _, small = write_toy_run(root, degree=0)
+    rng = np.random.default_rng(0)
+    rows = torch.from_numpy(rng.integers(0, 720, 95_003))
+    columns = {name: values[rows] + 0.01 * torch.from_numpy(rng.standard_normal(values[rows].shape, np.float32))
+               for name, values in small.table.columns.items()}  # fmt: skip
+    some = torch.randn(4096, generator=torch.Generator().manual_seed(0)) * 2
+    whole, alone = torch.sigmoid(some), torch.stack([torch.sigmoid(one) for one in some])  # in vectors, and one by one
+    odd = some[whole != alone] if (whole != alone).any() else some
+    columns["logits"] = odd.repeat(-(-95_003 // len(odd)))[:95_003].clone()
+    table = Table(columns, {name: values[rows] for name, values in small.table.labels.items()})
+    save_model(replace(small, table=table, nodes=small.nodes[:1]), root / "crowd")
+    return scene.parent
+
+
+@pytest.mark.parametrize("name", ["ply", "page"])
+def test_any_number_of_threads_writes_the_same_bytes(name: str, crowd: Path, tmp_path: Path) -> None:
+    before, made = torch.get_num_threads(), set()
+    try:
+        for threads in (1, 2, 3, 5):
+            torch.set_num_threads(threads)
+            (tmp_path / str(threads)).mkdir()
+            line = COMMANDS[name][1].replace("TOY/fit", str(crowd / "crowd")).replace("TOY", str(crowd))
+            out = tmp_path / str(threads) / COMMANDS[name][0]
+            assert cli.main(line.replace("OUT", str(out)).split()) == 0
+            made.add(out.read_bytes())
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert len(made) == 1
 
 
 # ---- several at a time ---------------------------------------------------------------------------------------------------

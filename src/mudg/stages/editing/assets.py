@@ -18,6 +18,7 @@ from pydantic import Field
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.processes import one_torch_thread
 from mudg.base.records import Number, StrictRecord, parse_record
 from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import refuse_overlap
@@ -84,6 +85,7 @@ def asset_from(parts: RunParts, name: str, scene: Path | None = None) -> Asset:
     return complete_asset(model, name, [frame.view for frame in recorded.frames])
 
 
+@one_torch_thread()
 def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset:
     """An object of a fitted scene, with the sides from which views show it; the others are closed (``models/scene/sides.py``)."""
     node = model.dynamic_object(name)

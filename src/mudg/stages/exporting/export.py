@@ -18,6 +18,7 @@ import numpy as np
 from mudg.base import log, store
 from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
+from mudg.base.processes import one_torch_thread
 from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import PointCloud, Scene
@@ -68,6 +69,7 @@ class Exported:
     named: dict[str, Path] = field(default_factory=dict)
 
 
+@one_torch_thread()
 def run(
     config: ExportConfig, name: str, source: Path, out: Path, *,
     scene: Path | None = None, edits: Path | None = None, overwrite: bool = False,
