@@ -181,8 +181,9 @@ def test_results_are_reused_refused_and_resumed(run: Path, tmp_path: Path, monke
 def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "shelf" / "red.safetensors"
     assert cli.main(["asset", "export", str(run), "car", "--out", str(file)]) == 0
+    assert verbs.export_asset(run, "car", file) == file  # the same again: verified
     with pytest.raises(UsageError, match="exists"):
-        verbs.export_asset(run, "car", file)
+        verbs.export_asset(run / "fit" / "street_gaussians", "car", file)  # without its scene
     with pytest.raises(UsageError, match="no dynamic object"):
         verbs.export_asset(run, "nobody", tmp_path / "x.safetensors")
     text = """

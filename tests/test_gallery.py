@@ -97,8 +97,9 @@ def test_a_page_is_replaced_on_demand_only(tmp_path: Path, capsys: pytest.Captur
     run = run_of(tmp_path / "run")
     out = tmp_path / "all.html"
     assert verbs.report([run], out) == out
+    assert verbs.report([run], out) == out  # the same again: verified
     with pytest.raises(UsageError, match="exists"):
-        verbs.report([run], out)
+        verbs.report([run, run_of(tmp_path / "another")], out)
     with pytest.raises(UsageError, match="HTML"):
         verbs.report([run], tmp_path / "all.pdf")
     assert cli.main(["report", str(run), "--out", str(out), "--overwrite"]) == 0

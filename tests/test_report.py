@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import html
 import html.parser
 import io
 import json
 import re
+import shlex
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +20,11 @@ import torch
 import toy_views
 from jinja2 import UndefinedError
 
+from mudg import cli
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
+from mudg.data.edits import read_edits
 from mudg.report import html as report_html
 from mudg.report import page as report_page
 from mudg.report import run_report
@@ -108,6 +113,33 @@ def test_the_page_is_well_formed_and_loads_nothing(page: str) -> None:
     assert not re.search(r"url\(\s*['\"]?(?!data:)", page)
     assert "@import" not in page
     assert "default-src 'none'" in page
+
+
+def test_the_report_holds_commands_that_can_be_copied_and_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = finished_run(Path("my run"))
+    nodes = [{"kind": "static", "name": "background"}, {"kind": "rigid", "name": "car 1", "label": "car"}]
+    store.write_json(out / "fit" / "mudg_s" / "model.json", {"nodes": nodes})
+    text = written(out).read_text(encoding="utf-8")
+    blocks = [html.unescape(found) for found in re.findall(r'class="commands">.*?<pre>(.*?)</pre>', text, re.DOTALL)]
+    lines = [line for block in blocks for line in block.splitlines()]
+    verbs = [shlex.split(line)[1] for line in lines if line.startswith("mudg ")]
+    assert {"view", "page", "edit", "render", "export", "asset", "run", "score"} <= set(verbs)
+    for line in lines:  # the score of this run is real, with its run.yaml
+        if line.startswith("mudg "):
+            args = cli.parse(shlex.split(line)[1:])
+            for given in (getattr(args, name, None) for name in ("run", "scene")):
+                assert given is None or Path(given).exists(), line
+    assert subprocess.run(next(x for x in lines if x.startswith("printf")), shell=True, check=True).returncode == 0
+    script = read_edits(Path("edits.yaml")) if Path("edits.yaml").exists() else None
+    assert script is not None and [(e.verb, list(e.settings.ids)) for e in script.edits] == [("remove", ["car 1"])]
+    before = store.digest(out / "score")
+    capsys.readouterr()
+    assert cli.main(shlex.split(next(x for x in lines if x.startswith("mudg score")))[1:]) == 0
+    assert "reused" in capsys.readouterr().err and store.digest(out / "score") == before
+    assert len(blocks) == text.count('class="commands"') and "navigator.clipboard" in text
 
 
 def test_every_control_has_a_label(page: str) -> None:

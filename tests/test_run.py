@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from mudg.base import (
     store,
     usage,
 )
-from mudg.base.errors import InputError, IntegrityError, NumericsError, UsageError
+from mudg.base.errors import InputError, IntegrityError, NumericsError, ResourceError, UsageError
 from mudg.report import run_report
 from mudg.stages import adapt, annotate, fit, fuse, ingest, render, run, score, synthesize
 from mudg.stages.config import RunConfig, run_preset, with_seed
@@ -50,6 +51,7 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     ):  # fmt: skip
         monkeypatch.setattr(module, "run", stand_in(name))
     monkeypatch.setattr(run, "_has_semantics", lambda _scene: seen["labelled"])
+    monkeypatch.setattr(run, "_forecast", lambda _config, scene: f"forecast of {scene.name}")
     monkeypatch.setattr(run, "_teaches", lambda _config, _scene: seen["teaches"])
     monkeypatch.setattr(score, "summary_table", lambda _out: "table")
 
@@ -96,6 +98,35 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
     files = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name not in ("run.json", "run.yaml")]
     assert sum(step["written_bytes"] for step in ledger["steps"].values()) == sum(path.stat().st_size for path in files) > 0
+
+
+def test_a_forecast_is_said_before_the_first_long_step(
+    tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run.run_chain(run_preset("fast"), "city", tmp_path / "out")
+    said = capsys.readouterr().err
+    assert said.index("== ingest") < said.index("forecast of scene") < said.index("== fuse")
+    assert verbs["ingest"][0][0].resolution == "", "a city has a size of its own"
+    run.run_chain(run_preset("fast"), "city", tmp_path / "out")
+    assert "forecast" not in capsys.readouterr().err
+    (tmp_path / "log").mkdir()
+    run.run_chain(run_preset("fast"), tmp_path / "log", tmp_path / "other")
+    assert verbs["ingest"][0][0].resolution == "480"
+
+
+def test_two_runs_in_one_folder_at_a_time(tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    run.run_chain(RunConfig(), "city", out)
+    record, sleeper = (out / "run.json").read_bytes(), subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    try:
+        store.write_json(out / "lock", {"pid": sleeper.pid, "host": socket.gethostname()})
+        with pytest.raises(ResourceError, match="another process is working in this folder"):
+            run.run_chain(run_preset("fast"), "city", out, overwrite=True)
+        assert (out / "run.json").read_bytes() == record
+    finally:
+        sleeper.communicate(b"\n")
+    run.run_chain(RunConfig(), "city", out)
+    assert not (out / "lock").exists()
 
 
 def test_a_recorded_log_is_adapted_to(tmp_path: Path, verbs: dict[str, Any]) -> None:

@@ -22,8 +22,10 @@ from browser import CHROMIUM, NO_BROWSER, Browser, BrowserError
 from toy_fitted import STREET, toy_fitted, write_toy_run
 from view_server import ask, serving
 
+from mudg import FittedScene
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
+from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
 from mudg.report.viewer import page as viewer_page
@@ -333,6 +335,49 @@ def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[P
         assert (seen["class"] == true.semantics.numpy()).mean() >= 0.97
         assert seen["confidence"][..., 0].max() <= 1.001
     assert opened.errors == []
+
+
+VIEWS = {
+    "recorded": ({"mode": "recorded", "t": 0.4, "shift": 0}, None),
+    "aside": ({"mode": "recorded", "t": 0.4, "shift": 2}, None),
+    "behind": ({"mode": "chase", "t": 0.0, "shift": 0, "behind": 30}, "fair poor"),
+    "above": ({"mode": "top", "t": 0.0, "shift": 0}, "fair poor"),
+    "back": ({"mode": "fly", "eye": [0, 0, 1.5], "yaw": 3.14, "pitch": -0.1}, "poor"),
+}
+
+
+@pytest.mark.slow
+@needs_browser
+@pytest.mark.parametrize("name", VIEWS)
+def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
+    name: str, opened: Browser, toy: tuple[Path, Path, SceneModel]
+) -> None:
+    """Against pictures of the program's own rasterizer, and what the page drew, counted here."""
+    state, words = VIEWS[name]
+    opened.run(f"mudg.settled({json.dumps(state)}).then(() => {{ mudg.onRest(); return 1; }})")
+    sign = opened.run("[document.getElementById('seen-word').className, document.getElementById('seen').textContent]")
+    found = opened.run("mudg.seenShare(mudg.last.view)")
+    small = opened.run("import('mudg/app').then((m) => m.scaled(mudg.last.view, Math.min(1, 96 / mudg.last.view.width)))")
+    sums = opened.run(f"Array.from(mudg.renderer.read(mudg.used().left, {json.dumps(small)}, mudg.state.t, 'confidence', new Set()))")
+    certainty, alpha = np.array(sums).reshape(small["height"], small["width"], 4)[..., [0, 3]].transpose(2, 0, 1)
+    camera = Camera("seen", *(small[key] for key in ("width", "height", "fx", "fy", "cx", "cy")))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.array(small["axes"]).T, small["eye"]
+    drawn = FittedScene(toy[2]).render(camera, pose, opened.run("mudg.state.t"))
+    covered = np.isfinite(drawn.depth_m)
+    assert (covered == (alpha >= 0.5)).mean() > 0.95
+    x, y = np.meshgrid(np.arange(small["width"]) + 0.5, np.arange(small["height"]) + 0.5)
+    rays = np.stack([(x - small["cx"]) / small["fx"], (y - small["cy"]) / small["fy"], np.ones_like(x)], -1) @ pose[:3, :3].T
+    below = rays[..., 2] / np.linalg.norm(rays, axis=-1) < -0.03  # 1.7 degrees below the horizon
+    ground = covered | below
+    assert found["empty"] == pytest.approx((~covered & below).sum() / ground.sum(), abs=0.04)
+    assert found["sure"] == pytest.approx(((certainty > 0.2) & (alpha >= 0.5)).sum() / ground.sum(), abs=0.03)
+    usual = "good" if found["sure"] >= 0.6 else "fair" if found["sure"] >= 0.35 else "poor"
+    assert sign[0] == usual if words is None else sign[0] in words.split()
+    assert ("% is empty" in sign[1]) == (found["empty"] >= 0.05)
+    assert ("No recorded camera looked this way" in sign[1]) == (name in ("above", "back"))
+    opened.run("mudg.change(), 1")
+    assert "old" in opened.run("document.getElementById('seen-word').className"), "until the camera rests"
 
 
 @pytest.mark.slow

@@ -121,12 +121,15 @@ class FittedScene:
         Args:
             out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which it was seen.
         """
+        from mudg.base.result_file import ResultFile
         from mudg.models.scene.edited import asset_of
         from mudg.stages.editing.assets import complete_asset, write_asset
 
         model, views = self._model, () if scene is None else tuple(frame.view for frame in scene.frames)
-        write_asset(Path(out), complete_asset(model, track_id, views) if views else asset_of(model, track_id))
-        return Path(out)
+        asset = complete_asset(model, track_id, views) if views else asset_of(model, track_id)
+        with ResultFile.open(Path(out), "asset export", {"id": track_id}, {}, overwrite=True) as file:
+            write_asset(file.staged(), asset)
+            return file.finish({"id": track_id})
 
     def render(self, camera: Camera, world_from_cam: ArrayLike, time_s: float, *, backend: str = "auto") -> Picture:
         """Render a camera at a pose and time.

@@ -14,7 +14,7 @@ import json
 import os
 import re
 import socket
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -26,6 +26,11 @@ from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageErr
 from mudg.base.processes import process_alive
 from mudg.base.replacement import Replacement, all_names, remove_files
 from mudg.base.usage import Meter, Usage, folder_bytes
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 _STATE, _SETTINGS, _LOCK, _LOG = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG
 _BEGUN = frozenset({_STATE, _SETTINGS, _LOCK})
@@ -261,6 +266,8 @@ class RunDir:
         self._made_folder = path != out or not path.is_dir()
         self._meter = Meter()
         self._earlier: Usage | None = None
+        self._seen: Mapping[str, Any] = {}
+        """What the folder's record said when it was opened."""
 
     @classmethod
     def open(
@@ -309,6 +316,7 @@ class RunDir:
                 remove_files(work, own(work))
             replacement.begin()
         run = cls(out, work, output, key, inputs)
+        run._seen = state if work == out else staged
         if work != out and staged.get("key") == key and _is_finished(work):
             _drop_lock_of_the_dead(work / _LOCK)
             run._take_place()
@@ -323,8 +331,10 @@ class RunDir:
         """Lock the folder and write down what is made in it."""
         import yaml
 
-        refuse_while_others_work(self.path / _LOCK)
-        store.write_json(self.path / _LOCK, {"pid": os.getpid(), "host": socket.gethostname()})
+        take_lock(self.path / _LOCK)
+        if run_state(self.path) != self._seen:
+            (self.path / _LOCK).unlink(missing_ok=True)
+            raise ResourceError("another process has worked in this folder meanwhile", where=str(self.path), remedy="repeat the command")
         self._write_state("running", {})
         values = {"verb": self.verb, **json.loads(store.json_text(dict(config)))}
         store.write_text(self.path / _SETTINGS, yaml.safe_dump(values, sort_keys=False))
@@ -438,13 +448,48 @@ def _drop_lock_of_the_dead(lock: Path) -> None:
             lock.unlink(missing_ok=True)
 
 
-def refuse_while_others_work(lock: Path) -> None:
+@contextlib.contextmanager
+def locked(lock: Path, what: Path | None = None) -> Iterator[None]:
+    """Hold a lock for this process alone: that of a file ``what``, else of the folder in which the lock lies.
+
+    Raises:
+        ResourceError: another live process of this machine holds it.
+    """
+    take_lock(lock, what)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # that of a dead process is in nobody's way
+            lock.unlink(missing_ok=True)
+
+
+def take_lock(lock: Path, what: Path | None = None) -> None:
+    """Write this process into a lock; of several that try at the same moment one succeeds.
+
+    Raises:
+        ResourceError: another live process of this machine holds it.
+    """
+    store.make_folder(lock.parent)
+    folder = os.open(lock.parent, os.O_RDONLY) if fcntl is not None else -1
+    try:
+        if fcntl is not None:
+            with contextlib.suppress(OSError):  # a file system without locks
+                fcntl.flock(folder, fcntl.LOCK_EX)
+        refuse_while_others_work(lock, what)
+        store.write_json(lock, {"pid": os.getpid(), "host": socket.gethostname()})
+    finally:
+        if fcntl is not None:
+            os.close(folder)
+
+
+def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
     """ResourceError if the process that wrote this lock still runs on this machine."""
     owner = _owner(lock) if lock.is_file() else None
     if owner is None:
         return
     pid, host = owner
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
-        raise ResourceError("another process is working in this folder", where=str(lock.parent),
+        busy = "writing this file" if what else "working in this folder"
+        raise ResourceError(f"another process is {busy}", where=str(what or lock.parent),
             got=f"pid {pid} on {host}",
             remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}")  # fmt: skip

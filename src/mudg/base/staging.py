@@ -12,7 +12,6 @@ import hashlib
 import os
 import re
 import shutil
-import socket
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -23,7 +22,7 @@ from mudg.base import log, store, transfer
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.remote import PACKAGES, checked_address, scheme_of
-from mudg.base.run_folder import refuse_while_others_work
+from mudg.base.run_folder import take_lock
 
 _OUTPUTS: Final = ("out", "to")
 """Flags that name what a verb writes."""
@@ -131,8 +130,7 @@ class _Staging:
         """The scratch folder, for this process alone. After a failure it stays, for the same command to go on with."""
         _make_private(self.folder)
         lock = self.folder / "lock"
-        refuse_while_others_work(lock)
-        store.write_json(lock, {"pid": os.getpid(), "host": socket.gethostname()})
+        take_lock(lock)
         try:
             yield
         except BaseException:

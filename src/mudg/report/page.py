@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from mudg.base import memory
 from mudg.core.pictures import depth_colors
 from mudg.report import html
+from mudg.report.commands import next_commands, step_commands
 from mudg.report.score_tables import (
     FLOOR,
     NOT_COMPUTED,
@@ -83,23 +85,25 @@ class Adaptation:
 
 def page(
     scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str, videos: Sequence[TrajectoryVideo],
-    columns: Sequence[str], adaptation: Adaptation | None = None, viewer: str = "",
+    columns: Sequence[str], adaptation: Adaptation | None = None, viewer: str = "", out: Path = Path(),
 ) -> str:  # fmt: skip
     """The text of the page.
 
     Args:
         scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
         columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if there was one.
-        viewer: relative address of the page that shows the fitted scene, or empty.
+        viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for commands.
     """
     scene = scores["scene"]
     heading, lead = headline(scores)
+    source = str(ledger.get("asked", {}).get("source", "LOG"))
     return html.render(
         "report.html.j2", title=f"{scene['id']}: mudg report", kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
         heading=heading, lead=lead, scene=scene, viewer=viewer, facts=_facts(scores, ledger), rules=scores["rules"],
         methods=scores["methods"], settings=settings, provenance=_provenance(scores, ledger),
         adaptation=None if adaptation is None else adaptation.record,
         adaptation_pictures=() if adaptation is None else adaptation.pictures,
+        next_commands=next_commands(out, source), step_commands=step_commands(out, source),
         **_player_values(scores, videos, columns), **_score_values(scores), **_time_values(ledger),
     )  # fmt: skip
 

@@ -72,7 +72,7 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     settings = out / "run.yaml"
     text = store.read_text(settings) if settings.is_file() else ""
     columns = list(_folders(out, scores))
-    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt"), viewer_address(out)))
+    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt"), viewer_address(out), out))
     return out / "report.html"
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from mudg.base.types import Scene, View
     from mudg.data.scene.check import Finding
+    from mudg.stages.config import RunConfig
     from mudg.stages.config.cost import SceneSize
 
 _CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av", "jinja2")
@@ -112,11 +113,11 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     from mudg import native
     from mudg.core.raster import probe
     from mudg.data.scene import read_scene
-    from mudg.stages.config import cost
+    from mudg.stages.config import PRESETS, cost
 
     scene = read_scene(path)
     cores = native.default_threads()
-    size, machine = _size(scene), cost.Machine(cores, probe.speed(cores), os.cpu_count() or 1)
+    size, machine = scene_size(scene), cost.Machine(cores, probe.speed(cores).now, os.cpu_count() or 1)
     devices = {"cpu": memory.free_bytes()}
     if torch.cuda.is_available():
         devices["cuda"] = torch.cuda.mem_get_info()[0]
@@ -132,14 +133,17 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
                    "steps": {step: asdict(of) for step, of in one.steps.items()}}
             for name, one in found.items()
         }  # fmt: skip
+    log_px = int(str(PRESETS["fast"]["ingest.resolution"]))
+    if max(size.width, size.height) > log_px and not size.exact:
+        lines.append(f"of the log itself, in place of this scene, --preset fast makes images {log_px} pixels wide and takes less")
     lines.append(
         f"speed of this machine at the moment: {machine.speed:.2f} of the one that forecasts were measured on, {cores} threads"
     )
     return records, lines
 
 
-def _size(scene: Scene) -> SceneSize:
-    """What forecasts depend on. The first sweep stands for all."""
+def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
+    """What forecasts depend on. The first sweep stands for all. config: of the run, whose cameras are shifted (None: the first)."""
     import numpy as np
 
     from mudg.data.scene import read_points
@@ -156,11 +160,12 @@ def _size(scene: Scene) -> SceneSize:
         else 0.0
     )
     exact = scene.source.recipe is not None
-    adapt = run_preset().adapt
+    config = config or run_preset()
+    cameras = [name for name in config.synthesize.cameras or (first.name,) if name in scene.cameras]
     return SceneSize(
-        len(scene.frames), len(scene.frames_of(first.name)), first.width, first.height, len(xyz), exact, seen=seen,
+        len(scene.frames), sum(len(scene.frames_of(name)) for name in cameras), first.width, first.height, len(xyz), exact, seen=seen,
         labelled=all("semantics" in frame.labels for frame in scene.frames),
-        adapts=not exact and not why_not(scene, replace(adapt, cameras=(first.name,))),
+        adapts=not exact and not why_not(scene, replace(config.adapt, cameras=tuple(cameras))),
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +16,11 @@ from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError
 from mudg.base.memory import in_words
-from mudg.base.run_folder import is_temporary, refuse_overlap
+from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
 from mudg.stages.config import FitConfig, RunConfig, SynthesizeConfig, with_device
-from mudg.stages.config.presets import NO_MODEL
+from mudg.stages.config.presets import NO_MODEL, PRESETS
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -68,7 +69,6 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     import torch
 
     from mudg import native
-    from mudg.report import run_report
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
@@ -76,6 +76,15 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     _refuse_overlap(config, source, out)
     refuse_missing(config.synthesize, config.fit)
     torch.set_num_threads(native.default_threads())
+    _Ledger.refuse_foreign(out, str(source))
+    with locked(out / "lock"):
+        return _run_locked(config, source, out, overwrite)
+
+
+def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: bool) -> dict[str, Any]:
+    """The chain, alone in its folder."""
+    from mudg.report import run_report
+
     ledger = _Ledger.open(out, config, str(source), overwrite)
     config = with_device(config)
     try:
@@ -105,12 +114,15 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
 
 def _write_viewer(out: Path) -> Path:
-    """Write the page that shows the fitted scene in a browser."""
+    """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside it."""
+    from mudg.base.result_file import description_path
     from mudg.report.run_report import VIEWER
     from mudg.stages.config import PageConfig
     from mudg.stages.viewing import view
 
-    return view.run_page(PageConfig(), out, out / VIEWER, report="report.html", overwrite=True)["page"]
+    page = view.page_of(PageConfig(), view.find_shown(PageConfig(), out, None, None), report="report.html")
+    store.remove(description_path(out / VIEWER))
+    return view.write_page(page, out / VIEWER, (out / VIEWER).with_name(f"{Path(VIEWER).stem}_page"))["page"]
 
 
 def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
@@ -168,15 +180,33 @@ def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Le
     if str(source) != CITY and _is_scene(source):
         scene = Path(source)
     else:
-        scene = ledger.timed(
-            Step("ingest", "scene", lambda: ingest.run(config.ingest, str(source), out / "scene", overwrite=overwrite))
-        )
+        of_preset = config.ingest.resolution == PRESETS["fast"]["ingest.resolution"]  # which is for logs: a city has a size of its own
+        settings = replace(config.ingest, resolution="") if str(source) == CITY and of_preset else config.ingest
+        scene = ledger.timed(Step("ingest", "scene", lambda: ingest.run(settings, str(source), out / "scene", overwrite=overwrite)))
+    if not ledger.has_done("fuse"):
+        log.info(_forecast(config, scene))
     if not _has_semantics(scene):
         labelled = out / "annotate"
         return ledger.timed(
             Step("annotate", "annotate", lambda: annotate.run(config.annotate, scene, labelled, overwrite=overwrite))
         )
     return scene
+
+
+def _forecast(config: RunConfig, scene: Path) -> str:
+    """A line on what the steps from here on will take."""
+    from mudg import native
+    from mudg.base import devices
+    from mudg.core.raster import probe
+    from mudg.data.scene import read_scene
+    from mudg.stages.config import cost
+    from mudg.stages.doctor import scene_size
+
+    size, cores = scene_size(read_scene(scene), config), native.default_threads()
+    speed = probe.speed(cores)
+    kind = "cpu" if config.device == "cpu" or devices.usual_device() == "cpu" else "cuda"
+    idle, now = (cost.estimate(config, size, cost.Machine(cores, one, os.cpu_count() or 1), kind) for one in (speed.idle, speed.now))
+    return cost.in_a_line(idle, now)
 
 
 def _has_semantics(scene: Path) -> bool:
@@ -325,14 +355,19 @@ class _Ledger:
                     "the output folder holds a run with other settings", where=str(out),
                     got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
                     remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
-        elif out.exists():
-            own = {"scene"} if _is_own_scene(source, out) else set()
-            if not out.is_dir() or any(entry.name not in own and not is_temporary(entry.name) for entry in out.iterdir()):
-                raise cls._foreign(out)
         ledger = cls(out, asked, before)
         ledger.save("running")
         store.write_text(out / "run.yaml", configuration.dump_yaml(config))
         return ledger
+
+    @classmethod
+    def refuse_foreign(cls, out: Path, source: str) -> None:
+        """UsageError if a folder without a ledger holds files of something else."""
+        own = {"lock", "scene"} if _is_own_scene(source, out) else {"lock"}
+        if (out / "run.json").is_file() or not out.exists():
+            return
+        if not out.is_dir() or any(entry.name not in own and not is_temporary(entry.name) for entry in out.iterdir()):
+            raise cls._foreign(out)
 
     @classmethod
     def _read(cls, path: Path) -> dict[str, Any]:
@@ -363,6 +398,10 @@ class _Ledger:
         self._report = {"key": key, "sha256": store.sha256_file(page)}
         self._steps["report"]["written_bytes"] = folder_bytes(page)
         self.save("complete")
+
+    def has_done(self, step: str) -> bool:
+        """Whether a step has ended before."""
+        return self._steps.get(step, {}).get("state") == "complete"
 
     def timed(self, step: Step) -> Any:
         """Do one step and add its seconds, also when it is interrupted; a reused result adds none. The next step begins with the memory

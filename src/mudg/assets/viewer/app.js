@@ -1,7 +1,7 @@
 // Holds the page together: data, state, renderer and overlay; decides what is drawn when. The controls are in ui.js.
 
 import { Arrival } from "mudg/arrival";
-import { Cameras, Drive } from "mudg/cameras";
+import { Cameras, Drive, rayOf } from "mudg/cameras";
 import { SplatScene, bytesOf, inflate, sectionsOf } from "mudg/data";
 import { PoseKeys, clamp } from "mudg/math";
 import { Overlay } from "mudg/overlay";
@@ -13,6 +13,7 @@ const SLOW_MS = 45, QUICK_MS = 18; // of a frame while moving: draw smaller, or 
 const SMALLEST = 0.22;
 const FRESH_MS = 250, FRESH_TIMES = 10; // at least, between pictures with more and more of a scene; and in times of the last one
 const CERTAIN = 0.2; // certainty from which on a surface is called determined by the recording
+const HORIZON = 0.03; // what nothing covers and lies so far below the horizon, as a sine, is ground, not sky
 const LONGEST_MS = 2500, LOADING_MS = 300; // of a picture at rest, and while chunks arrive: what would take longer is drawn smaller
 const PROBES = [SMALLEST, 0.4]; // sizes of the first pictures, which tell how long larger ones take
 const MOST_PIXELS = 2560 * 1440;
@@ -166,7 +167,7 @@ export class App {
     this.overlayDrawer.draw(whole, area, s, ratio);
     const small = scaled(whole, quality), { left, right, mode } = this.used();
     for (const one of new Set([left, right])) if (one?.sorter) this.ensureOrder(one, small);
-    if (!left.drawn) return;
+    if (left.drawn === null) return;
     const below = [area[0], height - area[1] - area[3], area[2], area[3]];
     const pictures = [this.pictureOf("left", left, small), right === "recorded" ? this.photo() : right ? this.pictureOf("right", right, small) : null];
     this.putExact(pictures);
@@ -284,14 +285,22 @@ export class App {
     return { width: view.width, height: view.height, drawn: order.length, sortMs: loaded.sorter.ms, values };
   }
 
-  /** Share of a small picture of this view that photographs determine, 0 to 1; null where the fit does not know. */
+  /**
+   * What a small picture of this view shows, in shares of its pixels without the sky, 0 to 1. What nothing covers is sky above the horizon,
+   * and below it ground that is missing.
+   * @returns {sure: determined by photographs, empty: nothing is there}; null where the fit does not know, or all is sky.
+   */
   seenShare(view) {
     const loaded = this.used().left;
-    if (!loaded.scene.hasCertainty || !loaded.drawn) return null;
+    if (!loaded.scene.hasCertainty || loaded.drawn === null) return null;
     const small = scaled(view, Math.min(1, 96 / view.width)), sums = this.renderer.read(loaded, small, this.state.t, "confidence", this.state.hidden);
-    let sure = 0, covered = 0;
-    for (let i = 0; i < sums.length; i += 4) { if (sums[i + 3] >= 0.5) { covered++; if (sums[i] > CERTAIN) sure++; } }
-    return covered ? sure / covered : null;
+    let sure = 0, covered = 0, empty = 0;
+    for (let i = 0; i < sums.length; i += 4) {
+      if (sums[i + 3] >= 0.5) { covered++; if (sums[i] > CERTAIN) sure++; }
+      else if (rayOf(small, (i / 4) % small.width, Math.floor(i / 4 / small.width))[2] < -HORIZON) empty++;
+    }
+    const all = covered + empty;
+    return all ? { sure: sure / all, empty: empty / all } : null;
   }
 }
 

@@ -7,6 +7,7 @@ import { PoseKeys, add, clamp, cross, dot, keysAround, quaternionOf, rotationOf,
 /** Ways to look, with their names for people. */
 export const MODES = { recorded: "Recorded camera", chase: "Behind the vehicle", top: "From above", orbit: "Round a point", fly: "Free" };
 const UP = [0, 0, 1], SAME = { gain: [1, 1, 1], offset: [0, 0, 0] };
+const MIDDLE = [0.3, 0.4, 0.5, 0.6, 0.7]; // places in a view, across and down, that tell whether a recorded camera looked there
 const HEIGHT_OF_VIEW = 0.9; // radians, of cameras that are not recorded ones
 
 /** The recorded views of every camera, and the vehicle's path. */
@@ -162,6 +163,23 @@ export class Cameras {
     }
     return Math.sqrt(least);
   }
+
+  /** Share of the directions in the middle of a view, 0 to 1, in which a recorded camera looked, from wherever it was. */
+  looked(view) {
+    const { cameras, frames } = this.drive.facts, rays = [];
+    for (const y of MIDDLE) for (const x of MIDDLE) rays.push(rayOf(view, x * view.width - 0.5, y * view.height - 0.5));
+    const inside = (ray, { camera, pose: m }) => {
+      const { width, height, fx, fy, cx, cy } = cameras[camera], along = (k) => m[k] * ray[0] + m[4 + k] * ray[1] + m[8 + k] * ray[2], z = along(2);
+      const u = fx * along(0) / z + cx, v = fy * along(1) / z + cy;
+      return z > 0 && u >= 0 && u <= width && v >= 0 && v <= height;
+    };
+    return rays.filter((ray) => frames.some((frame) => inside(ray, frame))).length / rays.length;
+  }
+}
+
+/** Direction in the world, of length 1, in which a pixel looks. */
+export function rayOf({ axes: [right, down, ahead], fx, fy, cx, cy }, x, y) {
+  return unit(add(add(ahead, right, (x + 0.5 - cx) / fx), down, (y + 0.5 - cy) / fy));
 }
 
 /** Intrinsics for another size of the same picture. */

@@ -19,7 +19,7 @@ class Loaded {
     this.programs = programs;
     this.sorter = new Sorter(scene);
     this.present = 0; // Gaussians that have come
-    this.drawn = 0;
+    this.drawn = null; // Gaussians of the last order; before the first one unknown
     this.buffer = gl.createBuffer();
   }
 }

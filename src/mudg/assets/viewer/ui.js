@@ -11,6 +11,7 @@ const LAYER_NAMES = { color: "Color", depth: "Depth", class: "Classes", instance
 const OVERLAYS = { boxes: "Boxes", paths: "Trajectories", lidar: "LiDAR", cameras: "Recorded cameras" };
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 const SEEN = 0.6, PARTLY = 0.35; // shares of a view that the recording determines
+const FAR_M = 5, LOOKED = 0.5; // farther away from all recorded cameras, or with less of the view in their directions: partly seen at best
 const $ = (id) => document.getElementById(id);
 
 /** An element with attributes and children; text is always text. */
@@ -136,15 +137,18 @@ export class Controls {
   seen() {
     const { app } = this, { state } = app, { view } = app.last;
     if (!view) return;
-    const share = app.seenShare(view), away = app.cameras.offPath(view.eye);
+    const found = app.seenShare(view), away = app.cameras.offPath(view.eye), looked = app.cameras.looked(view);
+    const share = found === null ? null : away > FAR_M || looked < LOOKED ? Math.min(found.sure, SEEN - 1e-3) : found.sure;
     const where = state.mode === "recorded" && !state.shift && !state.up ? "Recorded path." : `${away.toFixed(1)} m from the nearest recorded camera.`;
     const held = state.mode === "recorded" && !state.shift && !state.up && app.drive.nearestFrame(state.camera, state.t);
     const split = held && Math.abs(held.t - state.t) < 1e-3 ? (held.split === "test" ? " This frame was held out of the fit." : " The fit learned from this frame.") : "";
     const word = share === null ? "" : share >= SEEN ? "Seen by the recording" : share >= PARTLY ? "Partly seen by the recording" : "Mostly not seen by the recording";
     $("seen-word").textContent = word;
     $("seen-word").className = share >= SEEN ? "good" : share >= PARTLY ? "fair" : "poor";
-    const known = share === null ? "" : ` The recording determines ${Math.round(100 * share)} % of what is drawn here.`;
+    const known = found === null ? "" : ` The recording determines ${Math.round(100 * found.sure)} % of this view`
+      + `${found.empty >= 0.05 ? `; ${Math.round(100 * found.empty)} % is empty` : ""}.${looked < LOOKED ? " No recorded camera looked this way." : ""}`;
     $("seen").textContent = where + split + known;
+    $("seen").classList.remove("old");
     $("seen").dataset.share = share === null ? "" : share.toFixed(4);
   }
 
@@ -218,6 +222,7 @@ export class Controls {
   show() {
     const { app } = this, s = app.state;
     $("edits").disabled = !s.hidden.size && !s.edits.length;
+    for (const id of ["seen-word", "seen"]) $(id).classList.add("old"); // until the camera rests: it tells of another view
     $("mode").value = s.mode;
     $("camera").value = s.camera;
     $("compare").value = s.compare;

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -37,8 +37,16 @@ def scene() -> tuple[Gaussians, View]:
     return gaussians, View(Camera("probe", WIDTH, HEIGHT, 200.0, 200.0, WIDTH / 2, HEIGHT / 2), np.eye(4), 0.0)
 
 
-def speed(threads: int, for_s: float = 0.4) -> float:
-    """Speed of this machine with so many threads at work, as a share of the reference's; other programs at work lower it.
+class Speed(NamedTuple):
+    """Speed of a machine as a share of the reference's: over the time of measurement, which other programs at work lower, and of its
+    fastest pass, which they disturb least."""
+
+    now: float
+    idle: float
+
+
+def speed(threads: int, for_s: float = 0.4) -> Speed:
+    """Measure the speed of this machine with so many threads at work.
 
     Args:
         for_s: seconds to measure for, after one pass to warm up.
@@ -47,17 +55,16 @@ def speed(threads: int, for_s: float = 0.4) -> float:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        passes, took_s = 0, 0.0
+        passes_s: list[float] = []
         one_pass(gaussians, view)
-        while took_s < for_s:
+        while sum(passes_s) < for_s:
             began = time.perf_counter()
             one_pass(gaussians, view)
-            took_s += time.perf_counter() - began
-            passes += 1
+            passes_s.append(time.perf_counter() - began)
     finally:
         torch.set_num_threads(before)
     expected_s = REFERENCE_S * (1 - SHARED + SHARED / threads)
-    return expected_s / (took_s / passes)
+    return Speed(expected_s * len(passes_s) / sum(passes_s), expected_s / min(passes_s))
 
 
 def one_pass(gaussians: Gaussians, view: View) -> None:

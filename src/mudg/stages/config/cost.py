@@ -130,7 +130,7 @@ SCORE_FILE: Final = 19.7
 LOG_SCORE_FILE: Final = 30
 """Per pixel of a scored view: its truth, and the nearest fill; of recorded logs, whose images are those of a camera, per recorded one."""
 VIEWER_GAUSSIAN_FILE: Final = 26
-REPORT_FILE: Final = 1.1
+REPORT_FILE: Final = 1.0
 REPORT_ADAPTED_FILE: Final = 1_000_000
 REPORT_LARGEST: Final = 6_600_000
 PANEL_PX: Final = 320
@@ -419,6 +419,23 @@ def in_words(
         cells = [_cell(one.steps.get(step)) for one in found.values()]
         lines.append(f"    {step:<28}" + "".join(f"{cell:>26}" for cell in cells))
     return lines
+
+
+def in_a_line(idle: Estimate, now: Estimate) -> str:
+    """What a run is about to take, on this machine undisturbed and as busy as it is now."""
+    times = {name: seconds for name, seconds in idle.seconds.items() if seconds is not None}
+    unknown = [name for name, seconds in idle.seconds.items() if seconds is None]
+    if not times:
+        return "forecast: time not measured on this device"
+    total_s, now_s = sum(times.values()), sum(seconds or 0.0 for seconds in now.seconds.values())
+    longest = sorted(times, key=lambda name: -times[name])[:3]
+    busy = f", about {_duration(now_s)} if it stays as busy as it is now" if now_s > FACTOR * total_s else ""
+    more = f" and {', '.join(unknown)} (not measured)" if unknown else ""
+    parts = ", ".join(f"{name} {_duration(times[name])}" for name in longest)
+    return (
+        f"forecast: about {_duration(total_s)}{more} on this machine{busy} ({parts}); "
+        f"{idle.memory_bytes / 1e9:.1f} GB of memory, {_size(idle.written_bytes)} on disk"
+    )
 
 
 def _cell(cost: StepCost | None) -> str:

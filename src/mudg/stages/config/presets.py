@@ -22,11 +22,12 @@ DEMO_CITY = 3
 NO_MODEL: Final = "published"
 """Stands where a published-type model's folder must be given."""
 
-Value = bool | int | float | str | tuple[str, ...]
+Value = bool | int | float | str | tuple[str, ...] | tuple[float, ...]
 PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
     "fast": {
         "ingest.city.n_frames": 12, "ingest.city.width": 240, "ingest.city.height": 160, "ingest.city.cameras": ("front",),
-        "fit.iterations": 250, "synthesize.steps": 1,
+        "ingest.resolution": "480", "adaptation": "off",
+        "fit.iterations": 250, "synthesize.steps": 1, "synthesize.shifts_m": (3.0, -3.0), "render.shifts_m": (0.0, 3.0, -3.0),
     },
     "default": {
         "ingest.city.n_frames": 24, "ingest.city.width": 384, "ingest.city.height": 256,

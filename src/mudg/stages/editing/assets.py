@@ -18,7 +18,9 @@ from pydantic import Field
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.processes import one_torch_thread
 from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import View
 from mudg.data.scene import read_scene
@@ -56,18 +58,21 @@ def run_export(run: Path, name: str, out: Path, scene: Path | None = None, overw
         scene: the scene that a fit belongs to, for the sides from which the object was seen; a run's own is found.
 
     Raises:
-        UsageError: no such object, or the file exists and ``overwrite`` is not set.
+        UsageError: no such object, or another file is there and ``overwrite`` is not set.
     """
     refuse_overlap(out, {"run": run, "scene": scene})
-    if out.exists() and not overwrite:
-        raise UsageError("the file exists", where=str(out), remedy="choose another --out, or add --overwrite")
     if out.suffix != ".safetensors":
         raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
     parts = find_run(run)
-    asset = asset_from(parts, name, scene)
-    write_asset(out, asset)
-    log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions) in {out}")
-    return out
+    place = scene or parts.scene
+    inputs = {"fit": store.digest(parts.model), **({} if place is None else {"scene": store.digest(place)})}
+    with ResultFile.open(out, "asset export", {"id": name}, inputs, overwrite=overwrite) as file:
+        if file.complete:
+            return file.reused()
+        asset = asset_from(parts, name, scene)
+        write_asset(file.staged(), asset)
+        log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions)")
+        return file.finish({"id": name, "inputs": inputs})
 
 
 def asset_from(parts: RunParts, name: str, scene: Path | None = None) -> Asset:
@@ -80,6 +85,7 @@ def asset_from(parts: RunParts, name: str, scene: Path | None = None) -> Asset:
     return complete_asset(model, name, [frame.view for frame in recorded.frames])
 
 
+@one_torch_thread()
 def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset:
     """An object of a fitted scene, with the sides from which views show it; the others are closed (``models/scene/sides.py``)."""
     node = model.dynamic_object(name)

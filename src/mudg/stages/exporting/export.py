@@ -8,7 +8,6 @@ messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +18,8 @@ import numpy as np
 from mudg.base import log, store
 from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
+from mudg.base.processes import one_torch_thread
+from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import PointCloud, Scene
 from mudg.base.versions import version
@@ -68,6 +69,7 @@ class Exported:
     named: dict[str, Path] = field(default_factory=dict)
 
 
+@one_torch_thread()
 def run(
     config: ExportConfig, name: str, source: Path, out: Path, *,
     scene: Path | None = None, edits: Path | None = None, overwrite: bool = False,
@@ -88,19 +90,20 @@ def run(
     refuse_overlap(out, {"run": source, "scene": scene, "edits": edits})
     _refuse_settings(config, name)
     refuse_missing(name)
+    if not (cameras or name in FOLDERS):
+        _refuse_name(out, name)
     given = _opened(source, scene, edits, name in FORMATS)
     refuse_overlap(out, {"scene": given.parts.scene, **given.named})
+    settings = {**result_settings(config), "format": name}
     if cameras or name in FOLDERS:
-        recorded, settings = _known(given), {**result_settings(config), "format": name}
+        recorded = _known(given)
         folder = RunDir.open(out, _FOLDER if cameras else FOLDERS[name], settings, given.inputs, overwrite)
         return _cameras(name, given, recorded, folder) if cameras else write_folder(name, records_of(recorded, _points(given)), folder)
-    _refuse_name(out, name, overwrite)
-    if name in MESSAGES:
-        return _messages(config, name, given, Path(out))
-    request = requested(config, name, given)
-    content = FORMATS[name].write(request)
-    _written(out, name, config, request, content, given.inputs)
-    return Path(out)
+    with ResultFile.open(Path(out), "export", settings, given.inputs, overwrite=overwrite) as file:
+        if file.complete:
+            return file.reused()
+        about = (_messages if name in MESSAGES else _gaussians)(config, name, given, file.staged())
+        return file.finish({"format": name, "mudg": version(), **about, "inputs": given.inputs})
 
 
 def _refuse_settings(config: ExportConfig, name: str) -> None:
@@ -125,19 +128,11 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
         raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
 
 
-def _refuse_name(out: Path, name: str, overwrite: bool) -> None:
+def _refuse_name(out: Path, name: str) -> None:
     suffixes = (MESSAGES[name],) if name in MESSAGES else FORMATS[name].suffixes
     if not Path(out).name.lower().endswith(suffixes):
         expected = f"a name that ends in {' or '.join(suffixes)}"
         raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
-    for path in (Path(out), about_path(out)):
-        if path.exists() and not overwrite:
-            raise UsageError("the file exists", where=str(path), remedy="choose another --out, or add --overwrite")
-
-
-def about_path(out: Path) -> Path:
-    """The file beside an export that says what it is."""
-    return Path(out).with_name(Path(out).name + ".json")
 
 
 def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: bool) -> Exported:
@@ -147,8 +142,7 @@ def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: b
     parts = RunParts({}, source, None, False) if alone else find_run(source)
     place = scene or parts.scene
     inputs = {f"fit {key}".strip(): store.digest(path) for key, path in parts.fits.items() if path == parts.model}
-    if place is not None:
-        inputs["scene"] = store.digest(place)
+    inputs |= {key: store.digest(path) for key, path in (("scene", place), ("fused", parts.fused)) if path is not None}
     recorded = None if place is None else read_scene(place)
     if alone and edits is None:
         return Exported(parts, None, recorded, inputs)
@@ -215,24 +209,20 @@ def middle_s(model: SceneModel, recorded: Scene | None) -> float:
     return 0.0 if not keys else (min(float(k[0]) for k in keys) + max(float(k[-1]) for k in keys)) / 2
 
 
-def _written(
-    out: Path, name: str, config: ExportConfig, request: WriteRequest, content: bytes, inputs: Mapping[str, str]
-) -> None:
-    """The file, and beside it what it is."""
-    lost = losses(name, request)
+def _gaussians(config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write the Gaussians; returns what the file is."""
+    request = requested(config, name, given)
+    content, lost = FORMATS[name].write(request), losses(name, request)
     count = _count(request.scene) if request.time_s is None else len(request.cloud)
-    store.atomic_write(Path(out), content)
-    about: dict[str, Any] = {
-        "schema": 1, "format": name, "mudg": version(), "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content),
-        "gaussians": count, "degree": request.scene.degree, "time_s": request.time_s, "axes": config.axes,
-        "file_from_world": request.scene.file_from_world, "nodes": [node.name for node in request.scene.nodes],
-        "not_in_the_file": lost, "inputs": dict(inputs),
-    }  # fmt: skip
-    store.write_json(about_path(out), about)
+    store.atomic_write(out, content)
     when = "all of the motion" if request.time_s is None else f"at {request.time_s:g} s"
-    log.info(f"export: {count} Gaussians, {when}, {len(content) / 1e6:.2f} MB in {out}")
+    log.info(f"export: {count} Gaussians, {when}, {len(content) / 1e6:.2f} MB")
     for sentence in lost:
         log.warn(f"export: {name} does not hold {sentence}")
+    return {
+        "bytes": len(content), "gaussians": count, "degree": request.scene.degree, "time_s": request.time_s, "axes": config.axes,
+        "file_from_world": request.scene.file_from_world, "nodes": [node.name for node in request.scene.nodes], "not_in_the_file": lost,
+    }  # fmt: skip
 
 
 def _count(scene: SplatScene) -> int:
@@ -262,12 +252,13 @@ def _cameras(name: str, given: Exported, recorded: Scene, folder: RunDir) -> Pat
     return folder.path
 
 
-def _messages(config: ExportConfig, name: str, given: Exported, out: Path) -> Path:
-    """The log as messages over time, in a file."""
-    if name != "rerun":
-        return write_file(name, Told(records_of(_known(given), _points(given))), out)
-    splats = None if given.model is None else splat_scene(given.model, middle_s(given.model, given.log))
-    records = None if given.log is None else records_of(_known(given), _points(given) if splats is None else None)
+def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write the log as messages over time; returns what the file is."""
+    splats, records = None, None
+    if name == "rerun" and given.model is not None:
+        splats = splat_scene(given.model, middle_s(given.model, given.log))
+    if name != "rerun" or given.log is not None:
+        records = records_of(_known(given), _points(given) if splats is None else None)
     return write_file(name, Told(records, splats), out)
 
 

@@ -13,6 +13,7 @@ from mudg.base import geometry, log, store
 from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
+from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.splats.binary import MAX_BYTES
 from mudg.data.splats.cloud import SplatCloud
@@ -49,16 +50,19 @@ def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False)
         raise UsageError(
             "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
         )
-    if Path(out).exists() and not overwrite:
-        raise UsageError("the file exists", where=str(out), remedy="choose another --out, or add --overwrite")
-    cloud, found = read_file(Path(file), config)
-    asset = asset_of_cloud(cloud, config, f"{Path(file).name} ({found})")
-    write_asset(Path(out), asset)
-    length, width, height = asset.size_m
-    log.info(f"asset: {len(asset)} Gaussians of a {found} file, {length:.2f} x {width:.2f} x {height:.2f} m, in {out}")
-    if cloud.degree:
-        log.info("asset: colours that depend on the direction of view are not kept")
-    return Path(out)
+    source = _of_bounded_size(Path(file))
+    settings, inputs = {**result_settings(config), "name": source.name}, {"file": store.digest(source)}
+    with ResultFile.open(Path(out), "asset import", settings, inputs, overwrite=overwrite) as result:
+        if result.complete:
+            return result.reused()
+        cloud, found = read_file(source, config)
+        asset = asset_of_cloud(cloud, config, f"{source.name} ({found})")
+        write_asset(result.staged(), asset)
+        length, width, height = asset.size_m
+        log.info(f"asset: {len(asset)} Gaussians of a {found} file, {length:.2f} x {width:.2f} x {height:.2f} m")
+        if cloud.degree:
+            log.info("asset: colours that depend on the direction of view are not kept")
+        return result.finish({"format": found, "inputs": inputs})
 
 
 def refuse_import_settings(config: ImportConfig, name: str) -> None:
@@ -83,13 +87,14 @@ def refuse_other_settings(config: ImportConfig) -> None:
 
 def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
     """The Gaussians of a file in the axes of this program, and its format."""
-    try:
-        size = file.stat().st_size
-    except OSError as error:
-        raise InputError("file not found", where=str(file)) from error
+    return read_cloud(store.read_bytes(_of_bounded_size(file)), str(file), config.axes)
+
+
+def _of_bounded_size(file: Path) -> Path:
+    size = store.regular(file).stat().st_size
     if size > MAX_BYTES:
         raise InputError("the file is too large", where=str(file), expected=f"at most {MAX_BYTES} bytes", got=str(size))
-    return read_cloud(store.read_bytes(file), str(file), config.axes)
+    return file
 
 
 def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asset:

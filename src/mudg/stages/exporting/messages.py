@@ -58,15 +58,16 @@ def refuse_missing(name: str) -> None:
         ncore_package.package()
 
 
-def write_file(name: str, told: Told, out: Path) -> Path:
-    """Write a log as one file: ``mcap`` or ``rerun``."""
+def write_file(name: str, told: Told, out: Path) -> dict[str, int]:
+    """Write a log as one file, ``mcap`` or ``rerun``; returns its size."""
     if name == "rerun":
         title = told.records.scene.id if told.records is not None else "scene"
         write_rerun(out, told.records, told.splats, title)
     elif told.records is not None:
         store.write_blocks(out, McapBlocks(FoxgloveMessages(told.records), f"mudg {version()}", DIALECT))
-    log.info(f"export: {told.summary}, {out.stat().st_size / 1e6:.2f} MB in {out}")
-    return out
+    size = out.stat().st_size
+    log.info(f"export: {told.summary}, {size / 1e6:.2f} MB")
+    return {"bytes": size}
 
 
 def write_folder(name: str, records: LogRecords, folder: RunDir) -> Path:

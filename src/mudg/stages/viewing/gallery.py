@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.result_file import ResultFile
 from mudg.report.gallery import GalleryEntry, Unread, page, read_shown
 
 
@@ -22,13 +24,11 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
         ``page``: the file; ``shown``: how many folders are on it; ``text``.
 
     Raises:
-        UsageError: the output exists or is no HTML file. InputError: nothing can be shown.
+        UsageError: another page is there, or the output is no HTML file. InputError: nothing can be shown.
     """
     out = Path(out)
     if out.suffix != ".html":
         raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
-    if out.exists() and not overwrite:
-        raise UsageError("the output exists", where=str(out), remedy="choose another --out, or add --overwrite")
     shown: list[GalleryEntry] = []
     unread: list[Unread] = []
     for folder in _folders(runs):
@@ -43,7 +43,12 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
             got="; ".join(dict.fromkeys(one.reason for one in unread[:4])), expected="folders of mudg run, score or bench",
         )  # fmt: skip
     content = page(shown, unread, out.resolve()).encode()
-    store.atomic_write(out, content)
+    with ResultFile.open(out, "report", {}, {"page": hashlib.sha256(content).hexdigest()}, overwrite=overwrite) as file:
+        if file.complete:
+            file.reused()
+        else:
+            store.atomic_write(file.staged(), content)
+            file.finish({"runs": len(shown)})
     left = f", {len(unread)} not shown" if unread else ""
     text = f"page: {out.resolve()} ({len(shown)} runs{left}, {len(content) / 1e6:.1f} MB)"
     return {"page": out, "shown": len(shown), "text": text}

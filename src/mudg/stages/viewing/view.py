@@ -14,8 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from mudg.base import log, store
+from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
 from mudg.base.records import parse_record
+from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.ground import HeightMap
@@ -70,25 +72,34 @@ def run_page(
         ``page``: the file (of a folder, its ``index.html``); ``bytes``: of everything; ``gaussians``: on the page; ``text``.
 
     Raises:
-        UsageError: the output exists, or is an input. InputError: no fitted scene, or another log.
+        UsageError: another page is there, or the output is an input. InputError: no fitted scene, or another log.
     """
     out = Path(out)
     refuse_overlap(out, {"run": run if not _inside(out, run) else None, "scene": scene, "compare": compare})
     if out.suffix != ".html":
         raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
     folder = out.with_name(f"{out.stem}_page")
-    for path in (out, folder):
-        if path.exists() and not overwrite:
-            raise UsageError("the output exists", where=str(path), remedy="choose another --out, or add --overwrite")
     _refuse_foreign(folder)
-    return write_page(page_of(config, find_shown(config, run, scene, compare), report=report), out, folder)
+    sources = find_sources(config, run, scene, compare)
+    settings, inputs = {**result_settings(config), "report": report}, sources.digests()
+    with ResultFile.open(out, "page", settings, inputs, forms=(out, folder), overwrite=overwrite) as file:
+        if file.complete:
+            made, place = file.description(), file.reused()
+        else:
+            made = write_page(page_of(config, sources.read(), report=report), file.staged(), file.staged(folder))
+            form = out if made["page"] == file.staged() else folder
+            place = file.finish({"bytes": made["bytes"], "gaussians": made["gaussians"], "inputs": inputs}, form)
+    size = f"{made['bytes'] / 1e6:.1f} MB"
+    if place == folder:
+        place, size = folder / "index.html", f"{size}; needs a web server: python -m http.server --directory {folder.name}"
+    return {"page": place, "bytes": made["bytes"], "gaussians": made["gaussians"], "text": f"page: {place.resolve()} ({size})"}
 
 
 def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
     """Write a page: one file where it is small enough, else a folder. At most `ONE_FILE_BYTES` of it are held at a time.
 
     Returns:
-        As ``run_page``.
+        ``page``, ``bytes`` and ``gaussians``, as ``run_page``.
     """
     facts: dict[str, Any] = {}
     made, held = page.files(facts), list[PageFile]()
@@ -97,14 +108,13 @@ def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
         if sum(len(one.content) for one in held) * 4 // 3 > ONE_FILE_BYTES:
             path, size = _write_folder(page, folder, held, made, facts)
             store.remove(out)
-            text = f"page: {path.resolve()} ({size / 1e6:.1f} MB; needs a web server: python -m http.server --directory {folder.name})"
             break
     else:
         content = page.one_file(held, facts)
-        log.info(needs_text(page, out, f"{len(content) / 1e6:.1f} MB"))
+        log.info(needs_text(page, "to be written", f"{len(content) / 1e6:.1f} MB"))
         store.atomic_write(out, content)
-        path, size, text = out, len(content), f"page: {out.resolve()} ({len(content) / 1e6:.1f} MB)"
-    return {"page": path, "bytes": size, "gaussians": [packed.kept for _, packed in page.scenes], "text": text}
+        path, size = out, len(content)
+    return {"page": path, "bytes": size, "gaussians": [packed.kept for _, packed in page.scenes]}
 
 
 def _refuse_foreign(folder: Path) -> None:
@@ -117,7 +127,7 @@ def _write_folder(
 ) -> tuple[Path, int]:
     """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of everything."""
     page = replace(page, report=f"../{page.report}") if page.report else page  # the run's report lies beside the folder
-    log.info(needs_text(page, folder / "index.html", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"))
+    log.info(needs_text(page, "to be written", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"))
     size = 0
     with store.atomic_directory(folder) as place:
         for file in chain(begun, more):
@@ -141,11 +151,35 @@ def _inside(out: Path, run: Path) -> bool:
     return Path(out).resolve().parent == Path(run).resolve() and not (Path(run) / "model.json").is_file()
 
 
-def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Shown:
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Where the log and the fits of a page lie. fits: (folder, whether it is part of a run). cloud: fused points, where they are known."""
+
+    scene: Path
+    fits: tuple[tuple[Path, bool], ...]
+    cloud: Path | None
+
+    def digests(self) -> dict[str, str]:
+        """Digests of everything that is read."""
+        named = {"scene": self.scene, "fused": self.cloud} | {f"fit {n}": folder for n, (folder, _) in enumerate(self.fits)}
+        return {name: store.digest(path) for name, path in named.items() if path is not None}
+
+    def read(self) -> Shown:
+        """What is there.
+
+        Raises:
+            InputError: it cannot be read, or the fits are of different logs.
+        """
+        loaded = read_scene(self.scene)
+        fits = tuple(_read_fit(folder, whole, loaded) for folder, whole in self.fits)
+        return Shown(loaded, fits, None if self.cloud is None else read_fused(self.cloud))
+
+
+def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Sources:
     """The log and the fits that a page is to show.
 
     Raises:
-        InputError: no fitted scene, no log, or fits of different logs. UsageError: a fit has no scene of its own and none was given.
+        InputError: no fitted scene. UsageError: a fit has no scene of its own and none was given, or a run no such fit.
     """
     parts = find_run(run)
     place = scene or parts.scene
@@ -155,24 +189,28 @@ def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path 
             where=str(run),
             remedy="add --scene FOLDER, or give the folder of a run",
         )
-    loaded = read_scene(place)
-    fits = [_fit_of(parts, config.method, loaded)]
+    name, fits = config.method, [_fit_of(parts, config.method)]
     if compare is not None:
         others = find_run(compare)
-        same = (
-            config.method
-            if Path(compare).resolve() != Path(run).resolve()
-            else next((n for n in others.fits if n != fits[0][0]), "")
-        )
-        fits.append(_fit_of(others, same, loaded))
-    return Shown(loaded, tuple(fits), None if parts.fused is None else read_fused(parts.fused))
+        if Path(compare).resolve() == Path(run).resolve():
+            name = next((n for n, folder in others.fits.items() if folder != fits[0][0]), "")
+        fits.append(_fit_of(others, name))
+    return Sources(place, tuple(fits), parts.fused)
 
 
-def _fit_of(parts: RunParts, method: str, scene: Scene) -> tuple[str, SceneModel]:
+def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Shown:
+    """``find_sources``, read."""
+    return find_sources(config, run, scene, compare).read()
+
+
+def _fit_of(parts: RunParts, method: str) -> tuple[Path, bool]:
     if method and parts.whole and method not in parts.fits:
         raise UsageError("the run has no such fit", where="--method", expected=", ".join(parts.fits), got=method)
-    folder = parts.fits[method] if method in parts.fits else parts.model
-    model = model_of_scene(folder, scene) if not parts.whole else load_model(folder)
+    return parts.fits.get(method, parts.model), parts.whole
+
+
+def _read_fit(folder: Path, whole: bool, scene: Scene) -> tuple[str, SceneModel]:
+    model = load_model(folder) if whole else model_of_scene(folder, scene)
     if model.facts.get("scene", scene.id) != scene.id:
         raise InputError(
             "fits of different logs cannot be compared",

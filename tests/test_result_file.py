@@ -1,0 +1,370 @@
+"""Outputs that are one file: with their own description at any moment, one writer at a time, verified when a command is repeated."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from faults import failing, in_child, killed, points
+from test_gallery import run_of
+from toy_fitted import write_toy_run
+
+from mudg import FittedScene, cli
+from mudg.base import store
+from mudg.base.errors import ResourceError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, take_lock
+from mudg.core.table import Table
+from mudg.stages.config import PageConfig
+from mudg.stages.fitting.storage import save_model
+from mudg.stages.viewing import view
+
+
+@pytest.fixture(autouse=True)
+def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed process loses nothing that the system has; only a power failure would."""
+    monkeypatch.setattr(os, "fsync", lambda _fd: None)
+    monkeypatch.setattr(os, "sync", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("toy").resolve()
+    write_toy_run(root, degree=0)
+    run_of(root / "run")
+    run_of(root / "other_run")
+    assert cli.main(["export", "ply", str(root / "fit"), "--out", str(root / "van.ply"), "--quiet"]) == 0
+    return root
+
+
+COMMANDS: dict[str, tuple[str, str, str]] = {
+    "ply": ("a.ply", "export ply TOY/fit --quiet --out OUT", "--time-s 0.2"),
+    "mcap": ("a.mcap", "export mcap TOY/scene --quiet --out OUT", "--overwrite"),
+    "asset": ("a.safetensors", "asset export TOY/fit car-1 --quiet --out OUT", "--scene TOY/scene"),
+    "import": ("a.safetensors", "asset import TOY/van.ply --quiet --out OUT", "--length-m 4"),
+    "page": ("a.html", "page TOY/fit --scene TOY/scene --quiet --out OUT --images 0", "--lidar-points 0"),
+    "report": ("a.html", "report --quiet --out OUT TOY/run", "TOY/other_run"),
+}
+"""Name of the output, a command, and words that make another result of it."""
+
+
+def command(name: str, toy: Path, folder: Path, more: str = "") -> Callable[[], int]:
+    out, words, _ = COMMANDS[name]
+    line = f"{words} {more}".replace("TOY", str(toy)).replace("OUT", str(folder / out)).split()
+    return lambda: cli.main(line)
+
+
+def pair(out: Path) -> dict[str, bytes]:
+    """The file and its description, which must belong together where the file is there."""
+    about = out.with_name(f"{out.name}.json")
+    if not out.exists():
+        return {}
+    content = out.read_bytes()
+    assert json.loads(about.read_text())["sha256"] == hashlib.sha256(content).hexdigest(), "the description is of another file"
+    return {out.name: content, about.name: about.read_bytes()}
+
+
+def folder_of(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_killed_at_any_moment_and_repeated_ends_in_the_same_pair(name: str, toy: Path, tmp_path: Path) -> None:
+    work = tmp_path / "counted"
+    work.mkdir()
+    with points(lambda *_: None, work) as done:
+        assert command(name, toy, work)() == 0
+    whole = pair(work / COMMANDS[name][0])
+    assert folder_of(work) == whole, "nothing else lies there"
+    last = [number for number, what in enumerate(done, 1) if COMMANDS[name][0] in what or "part" in what][-8:]
+    for number in sorted({*range(2, len(done) + 1, 5), *last[1::2]}):
+        place = tmp_path / f"kill{number}"
+        place.mkdir()
+        assert in_child(command(name, toy, place), killed(number), place) == -9
+        pair(place / COMMANDS[name][0])
+        assert command(name, toy, place)() == 0, f"after a kill at {done[number - 1]}"
+        assert folder_of(place) == whole, f"after a kill at {done[number - 1]}"
+        shutil.rmtree(place)
+
+
+@pytest.mark.parametrize("name", ["ply", "page"])
+def test_replacing_killed_at_any_moment_loses_neither(name: str, toy: Path, tmp_path: Path) -> None:
+    out, _, other = COMMANDS[name]
+    for place in (old := tmp_path / "old", new := tmp_path / "new"):
+        place.mkdir()
+    assert command(name, toy, old)() == 0 and command(name, toy, new, other)() == 0
+    before, after = pair(old / out), pair(new / out)
+    assert before[out] != after[out]
+    replaced = f"{other} --overwrite"
+    shutil.copytree(old, tmp_path / "x")
+    with points(lambda *_: None, tmp_path / "x") as done:
+        assert command(name, toy, tmp_path / "x", replaced)() == 0
+    for number in range(1, len(done) + 1):
+        place = tmp_path / f"kill{number}"
+        shutil.copytree(old, place)
+        assert in_child(command(name, toy, place, replaced), killed(number), place) == -9
+        found = pair(place / out)
+        assert found in ({}, before, after), f"after a kill at {done[number - 1]}"
+        shutil.copytree(place, tmp_path / "again")  # either command finds a whole result, or makes its own
+        assert command(name, toy, place, replaced)() == 0 and folder_of(place) == after
+        assert command(name, toy, tmp_path / "again")() in (0, 2)
+        assert pair(tmp_path / "again" / out) in (before, after), f"after a kill at {done[number - 1]}"
+        for folder in (place, tmp_path / "again"):
+            shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "mcap"])
+def test_another_result_is_replaced_on_demand_only(name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, _, other = COMMANDS[name]
+    assert command(name, toy, tmp_path)() == 0
+    before = pair(tmp_path / out)
+    stamp = (tmp_path / out).stat().st_mtime_ns
+    assert command(name, toy, tmp_path)() == 0 and (tmp_path / out).stat().st_mtime_ns == stamp
+    assert command(name, toy, tmp_path, other)() == 2 and "the file exists" in capsys.readouterr().err
+    assert folder_of(tmp_path) == before
+    assert command(name, toy, tmp_path, f"{other} --overwrite")() == 0
+    assert pair(tmp_path / out)[out] != before[out]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_files_without_a_description_and_altered_ones(name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / COMMANDS[name][0]
+    about = out.with_name(f"{out.name}.json")
+    assert command(name, toy, tmp_path)() == 0
+    whole = folder_of(tmp_path)
+    about.unlink()  # an earlier version, stopped between the two
+    assert command(name, toy, tmp_path)() == 0 and folder_of(tmp_path) == whole
+    out.write_bytes(whole[out.name][:-1] + b"?")
+    assert command(name, toy, tmp_path)() == 4 and "altered" in capsys.readouterr().err
+    about.unlink()
+    assert command(name, toy, tmp_path)() == 2 and "exists" in capsys.readouterr().err
+    assert out.read_bytes().endswith(b"?") and [path.name for path in tmp_path.iterdir()] == [out.name]
+    out.unlink()
+    about.write_text('{"mine": 1}')
+    assert command(name, toy, tmp_path)() == 2 and about.read_text() == '{"mine": 1}'
+    assert command(name, toy, tmp_path, "--overwrite")() == 0 and folder_of(tmp_path) == whole
+    out.unlink()
+    about.unlink()
+    (out / "mine").mkdir(parents=True)
+    assert command(name, toy, tmp_path, "--overwrite")() == 5 and (out / "mine").is_dir()
+
+
+@pytest.mark.parametrize("name", ["ply", "asset", "page"])
+def test_a_full_disk_at_any_write_leaves_what_the_next_try_completes(name: str, toy: Path, tmp_path: Path) -> None:
+    out = COMMANDS[name][0]
+    work = tmp_path / "counted"
+    work.mkdir()
+    with points(lambda *_: None, work) as done:
+        assert command(name, toy, work)() == 0
+    for number in range(1, len(done) + 1, 2):
+        place = tmp_path / f"full{number}"
+        place.mkdir()
+        with points(failing(number), place):
+            assert command(name, toy, place)() in (0, 5)
+        pair(place / out)
+        assert command(name, toy, place)() == 0 and folder_of(place) == folder_of(work)
+
+
+def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
+    monkeypatch.setattr(view, "CHUNK", 64)
+
+    def page(folder: Path) -> dict[str, Any]:
+        return view.run_page(PageConfig(images=0), toy / "fit", folder / "a.html", scene=toy / "scene")
+
+    (tmp_path / "x").mkdir()
+    with points(lambda *_: None, tmp_path / "x") as done:
+        made = page(tmp_path / "x")
+    assert made["page"] == tmp_path / "x" / "a_page" / "index.html"
+    whole = {path.name: path.read_bytes() for path in made["page"].parent.iterdir()}
+    assert page(tmp_path / "x") == made
+    for number in range(1, len(done) + 1, max(1, len(done) // 12)):
+        place = tmp_path / f"kill{number}"
+        place.mkdir()
+        assert in_child(lambda place=place: page(place), killed(number), place) == -9
+        again = page(place)["page"]
+        assert {path.name: path.read_bytes() for path in again.parent.iterdir()} == whole, done[number - 1]
+        assert {path.name for path in place.iterdir()} == {"a_page", "a.html.json"}
+    (made["page"].parent / "index.html").write_text("altered")
+    with pytest.raises(Exception, match="altered"):
+        page(tmp_path / "x")
+
+
+# ---- any number of threads -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fit of 95,003 Gaussians: torch divides them among its threads, and rounds otherwise where a part does not fill a vector."""
+    root = tmp_path_factory.mktemp("crowd").resolve()
+    scene, _, _, small = write_toy_run(root, degree=0)
+    rng = np.random.default_rng(0)
+    rows = torch.from_numpy(rng.integers(0, 720, 95_003))
+    columns = {name: values[rows] + 0.01 * torch.from_numpy(rng.standard_normal(values[rows].shape, np.float32))
+               for name, values in small.table.columns.items()}  # fmt: skip
+    some = torch.randn(4096, generator=torch.Generator().manual_seed(0)) * 2
+    whole, alone = torch.sigmoid(some), torch.stack([torch.sigmoid(one) for one in some])  # in vectors, and one by one
+    odd = some[whole != alone] if (whole != alone).any() else some
+    columns["logits"] = odd.repeat(-(-95_003 // len(odd)))[:95_003].clone()
+    table = Table(columns, {name: values[rows] for name, values in small.table.labels.items()})
+    save_model(replace(small, table=table, nodes=small.nodes[:1]), root / "crowd")
+    return scene.parent
+
+
+@pytest.mark.parametrize("name", ["ply", "page"])
+def test_any_number_of_threads_writes_the_same_bytes(name: str, crowd: Path, tmp_path: Path) -> None:
+    before, made = torch.get_num_threads(), set()
+    try:
+        for threads in (1, 2, 3, 5):
+            torch.set_num_threads(threads)
+            (tmp_path / str(threads)).mkdir()
+            line = COMMANDS[name][1].replace("TOY/fit", str(crowd / "crowd")).replace("TOY", str(crowd))
+            out = tmp_path / str(threads) / COMMANDS[name][0]
+            assert cli.main(line.replace("OUT", str(out)).split()) == 0
+            made.add(out.read_bytes())
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert len(made) == 1
+
+
+# ---- several at a time ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def children() -> Iterator[list[int]]:
+    started: list[int] = []
+    yield started
+    for child in started:
+        os.waitpid(child, 0)
+
+
+def forked(work: Callable[[], int], go: Path) -> int:
+    """A process that does the work as soon as a file is there; its exit code is what the work returns."""
+    child = os.fork()
+    if child:
+        return child
+    code = 99
+    try:
+        while not go.exists():
+            time.sleep(0.001)
+        code = work()
+    finally:
+        os._exit(code)
+
+
+def test_two_exports_to_one_file_at_a_time(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader never sees a file with another's description, and only one of the two writes."""
+    out, go, slow = tmp_path / "a.ply", tmp_path / "go", tmp_path / "slow"
+    write = store.atomic_write
+
+    def slowly(path: Path, content: bytes) -> None:
+        write(path, content)
+        if path.suffix == ".ply":
+            slow.touch()
+            time.sleep(0.6)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store, "atomic_write", slowly)
+        first = forked(command("ply", toy, tmp_path), go)
+    go.touch()
+    while not slow.exists():
+        time.sleep(0.005)
+    assert command("ply", toy, tmp_path, "--time-s 0.2")() == 5
+    assert command("ply", toy, tmp_path, "--time-s 0.2 --overwrite")() == 5
+    assert os.waitstatus_to_exitcode(os.waitpid(first, 0)[1]) == 0
+    assert json.loads((tmp_path / "a.ply.json").read_text())["time_s"] != 0.2
+    pair(out)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.ply", "a.ply.json", "go", "slow"}
+
+
+def test_readers_see_pairs_while_files_are_replaced(toy: Path, tmp_path: Path) -> None:
+    out, seen, wrong, stop = tmp_path / "a.ply", set(), [], threading.Event()
+
+    def read() -> None:
+        while not stop.is_set():
+            try:
+                first = out.read_bytes()
+                about = json.loads((tmp_path / "a.ply.json").read_text())
+                if out.read_bytes() != first:
+                    continue  # it was replaced while the two were read
+            except FileNotFoundError as missing:
+                if missing.filename == str(tmp_path / "a.ply.json"):
+                    wrong.append("a file without description")
+                continue
+            seen.add(about["time_s"])
+            if about["sha256"] != hashlib.sha256(first).hexdigest():
+                wrong.append("another's description")
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for number in range(12):
+        assert command("ply", toy, tmp_path, f"--time-s 0.{number} --overwrite")() == 0
+    stop.set()
+    reader.join()
+    assert not wrong and len(seen) > 1
+
+
+def test_of_many_that_start_together_one_takes_the_lock(tmp_path: Path) -> None:
+    lock = tmp_path / "lock"
+    store.write_json(lock, {"pid": 2**22 - 3, "host": os.uname().nodename})  # of a dead process
+
+    def take() -> int:
+        try:
+            take_lock(lock)
+        except ResourceError:
+            return 7
+        (tmp_path / f"mine{os.getpid()}").touch()
+        while not (tmp_path / "end").exists():  # it works in there until all have tried
+            time.sleep(0.005)
+        return 0
+
+    for round_ in range(3):
+        go = tmp_path / f"go{round_}"
+        started = [forked(take, go) for _ in range(8)]
+        go.touch()
+        time.sleep(0.5)
+        (tmp_path / "end").touch()
+        codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in started]
+        assert sorted(codes) == [0, *[7] * 7]
+        (tmp_path / "end").unlink()
+
+
+def test_a_folder_that_another_process_filled_meanwhile_is_not_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between a look into the folder and its lock another command can have finished there."""
+    output = VerbOutput("small", 1, ("*.txt",))
+
+    def fill(value: int) -> None:
+        run = RunDir.open(tmp_path / "out", output, {"value": value}, {})
+        store.write_text(run.path / "out.txt", str(value))
+        run.finish()
+
+    begin = RunDir._begin
+
+    def later(run: RunDir, config: Any) -> None:
+        monkeypatch.setattr(RunDir, "_begin", begin)
+        fill(1)
+        begin(run, config)
+
+    monkeypatch.setattr(RunDir, "_begin", later)
+    with pytest.raises((ResourceError, UsageError)):
+        fill(2)
+    assert (tmp_path / "out" / "out.txt").read_text() == "1"
+    store.verify_manifest(tmp_path / "out")
+
+
+def test_an_object_of_an_edited_scene_takes_the_description_along(toy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.safetensors"
+    assert command("asset", toy, tmp_path)() == 0
+    FittedScene.read(toy / "fit", "cpu").export_asset("car-1", out)
+    pair(out)
