@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.errors import InputError, MudgError, UsageError, plain_lines
 from mudg.base.location import Location
 from mudg.stages.batches.folders import BatchFolder, EventLog
 from mudg.stages.batches.lists import REVIEW
@@ -204,7 +204,7 @@ def text_of(found: Sequence[Candidate], out: str) -> str:
     """What waits, for a terminal."""
     lines = [f"{one.scene} {one.stage}: {'; '.join(one.problems)}" for one in found]
     ways = f"mudg batch accept {out} --scenes NAME ..., reject likewise, or mudg batch retry {out} --reason quality"
-    return "\n".join([*lines, f"{len(found)} results wait for review", *([ways] if found else [])])
+    return plain_lines([*lines, f"{len(found)} results wait for review", *([ways] if found else [])])
 
 
 def write_page(folder: BatchFolder, found: Sequence[Candidate]) -> Location:

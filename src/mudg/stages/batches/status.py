@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from mudg.base import store
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, plain
 from mudg.base.memory import in_words
 from mudg.stages.batches import claims, quality, retries, review
 from mudg.stages.batches.folders import BatchFolder
@@ -312,7 +312,7 @@ def text_of(state: BatchStatus) -> str:
     console = Console(file=out, width=120, markup=False, highlight=False)
     console.print(grid)
     for words, count, example in state.reasons()[:_SHOWN]:
-        out.write(f"{count:7d} x {words}  (e.g. {example})\n")
+        out.write(f"{count:7d} x {plain(words)}  (e.g. {plain(example)})\n")
     if state.for_review:
         out.write(f"{state.for_review} results wait for review: mudg batch review {state.out}\n")
     out.write(

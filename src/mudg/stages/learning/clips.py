@@ -208,7 +208,7 @@ def open_streamed(
         cameras=data.cameras, held_out_every=0, label_confidence=data.label_confidence, seed=config.seed, published=points_alone,
     )  # fmt: skip
     scenes = read_list(data.scenes[0], data.held_out)
-    log.info(f"learn: {data.scenes[0]}: {scenes.summary()}")
+    log.info(*f"learn: {data.scenes[0]}: {scenes.summary()}".splitlines())
     return replace(config, data=data), ListedShards(scenes, cache, rules, data.bad_scenes)
 
 
