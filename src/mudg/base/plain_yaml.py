@@ -139,9 +139,9 @@ class _Builder:
         if holder is not None and isinstance(holder.value, dict) and holder.key is None:
             self._key(event, holder, line)
             return
-        path = ()
+        path: tuple[str | int, ...] = ()
         if holder is not None:
-            path = (*holder.path, holder.key if isinstance(holder.value, dict) else len(holder.value))
+            path = (*holder.path, len(holder.value) if holder.key is None else holder.key)
             if self._lines is not None:
                 self._lines.setdefault(path, line + 1)
         count = 1
