@@ -172,7 +172,9 @@ def _finished(folder: Path) -> str:
 
 
 def _contents(folder: Path) -> str:
-    summary = _state(folder).get("summary", {})
+    summary = _state(folder).get("summary")
+    if not isinstance(summary, Mapping):
+        return ""
     return ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str))
 
 

@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from mudg.base import store
-from mudg.base.errors import InputError, plain
+from mudg.base.errors import plain
 from mudg.base.memory import in_words
 from mudg.stages.batches import claims, quality, retries, review
 from mudg.stages.batches.folders import BatchFolder
@@ -158,7 +157,7 @@ def read_status(folder: BatchFolder) -> BatchStatus:
     """Read the state of a batch.
 
     Raises:
-        InputError: no batch is there.
+        InputError: no batch is there, or a record of it is damaged.
     """
     plan = folder.plan()
     names = [str(one["name"]) for one in plan["stages"]]
@@ -256,11 +255,10 @@ def _note_failure(state: BatchStatus, key: str, record: Mapping[str, Any], kind:
 
 
 def _fold_record(state: BatchStatus, folder: BatchFolder, key: str, is_done: bool, told: set[str]) -> None:
-    try:
-        file = folder.done(key) if is_done else folder.failed(key)
-        record = store.parse_json(file.load(), str(file))
-    except InputError:
+    file = folder.done(key) if is_done else folder.failed(key)
+    if not file.exists():  # tried again meanwhile
         return
+    record = folder.ended(file)
     told.add(key)
     if is_done:
         _add_done(state, record)
