@@ -64,7 +64,7 @@ def test_every_verb_is_understood_and_says_its_defaults() -> None:
         ("move: {id: a}", "edits.yaml", "list of edits"),
         ("", "edits.yaml", "list of edits"),
         ("- move: [1", "line 1", "not valid YAML"),
-        ("- !!python/object/apply:os.system ['ls']", "edits.yaml", "not valid YAML"),
+        ("- !!python/object/apply:os.system ['ls']", "line 1", "of which type it is"),
     ],
 )
 def test_what_is_wrong_is_told_with_its_place(text: str, where: str, said: str) -> None:

@@ -7,7 +7,6 @@ progress and messages to stderr.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import json
 import os
 import shlex
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mudg.base import failures, log, memory
-from mudg.base.errors import ResourceError, UsageError
+from mudg.base.errors import ResourceError, UsageError, nearest, plain, plain_lines
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
@@ -464,7 +463,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _show(result, as_json=args.json)
         return code
     except KeyboardInterrupt as interrupt:
-        _complain(f"stopped. Repeat the same command to resume: mudg {shlex.join(words)}")
+        _complain(plain(f"stopped. Repeat the same command to resume: mudg {shlex.join(words)}"))
         return TERMINATED if isinstance(interrupt, Terminated) else INTERRUPTED
     except BrokenPipeError:
         failures.silence(1)
@@ -481,10 +480,10 @@ def parse(words: Sequence[str]) -> Any:
     """Turn ``VERB flags...`` into the verb's flags object (see ``mudg.flags``); an unknown verb is a UsageError."""
     name = words[0]
     if name not in VERBS:
-        near = difflib.get_close_matches(name, list(VERBS), n=1, cutoff=0.5)
+        near = nearest(name, VERBS, 0.5)
         raise UsageError(
             f"there is no verb {name!r}", expected="one of " + ", ".join(VERBS),
-            remedy=f"did you mean `mudg {near[0]}`?" if near else "see mudg --help",
+            remedy=f"did you mean `mudg {near}`?" if near else "see mudg --help",
         )  # fmt: skip
     from mudg import flags
 
@@ -500,7 +499,7 @@ def _with_named_output(args: Any) -> Any:
 
 def _say(text: str) -> None:
     try:
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(plain_lines(text.split("\n")) + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
         raise
@@ -525,7 +524,7 @@ def _show(result: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         _say(json.dumps(result, indent=1, default=str, allow_nan=False))
     else:
-        _say(text if text is not None else "\n".join(f"{name}: {value}" for name, value in result.items()))
+        _say(text if text is not None else plain_lines(f"{name}: {value}" for name, value in result.items()))
 
 
 class Terminated(KeyboardInterrupt):

@@ -117,7 +117,7 @@ def latest(folder: Path) -> Checkpoint | None:
             return Checkpoint(int(content["step"]), path, content["state"])
         except IntegrityError as error:
             problems.append(str(error))
-            log.warn(f"checkpoint {path} does not verify and is skipped:\n{error}")
+            log.warn(f"checkpoint {path} does not verify and is skipped:", *str(error).splitlines())
     if problems:
         raise IntegrityError("no checkpoint verifies", where=str(folder), got=f"{len(problems)} damaged",
             remedy="restore the folder from a copy, or delete it to start again")  # fmt: skip

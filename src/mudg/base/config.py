@@ -8,7 +8,6 @@ which it was still a plain value.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, UsageError, nearest
 from mudg.base.records import first_problem
 
 Config = TypeVar("Config")
@@ -120,9 +119,9 @@ def _merge(
         group = known.get(name)
         is_group, is_mapping = dataclasses.is_dataclass(group), isinstance(value, Mapping)
         if known and name not in known:
-            near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+            near = nearest(name, known, 0.5)
             what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
-            remedy = f"did you mean {path}{near[0]}?" if near else "remove it"
+            remedy = f"did you mean {path}{near}?" if near else "remove it"
             if str(name).split(".")[0] in known and "." in str(name):
                 remedy = (
                     "write each part before a dot as a group: "

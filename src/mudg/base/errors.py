@@ -6,11 +6,52 @@ The command line maps each class to an exit code; nothing else in the package kn
 
 from __future__ import annotations
 
-from typing import Self
+import difflib
+import re
+from collections.abc import Iterable
+from typing import Final, Self
+
+MOST_LETTERS: Final = 200
+"""Of a value in a message: names and values of foreign files may be megabytes long."""
+_CONTROLS: Final = re.compile("[\x00-\x1f\x7f-\x9f\xad\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
+"""What a terminal obeys, what turns the direction of writing, what is not seen, and halves of letters that cannot be written."""
+_LONGEST_LINE: Final = 2000
+_CONTINUED: Final = "\n    "
+"""A further line of a remedy."""
+
+
+def plain(text: object) -> str:
+    """A text as one line without control characters: they are written as escapes, as in ``\\x1b`` and ``\\n``."""
+    return _CONTROLS.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), str(text))
+
+
+def short(value: object, most: int = MOST_LETTERS) -> str:
+    """``plain`` of a value's text; of one longer than ``most`` letters the middle is left out."""
+    text = str(value)
+    text = plain(text if len(text) <= 2 * most else text[:most] + text[-most:])
+    return text if len(text) <= most else f"{text[: most - most // 3 - 5]} ... {text[-(most // 3) :]}"
+
+
+def plain_lines(lines: Iterable[object]) -> str:
+    """Lines of a report or table for a terminal: none of them can be broken, or say something to the terminal."""
+    return "\n".join(short(line, _LONGEST_LINE) for line in lines)
+
+
+def nearest(name: object, known: Iterable[str], least: float = 0.6) -> str:
+    """The known name that is most like another; empty where none is. least: likeness from 0 to 1."""
+    return next(iter(difflib.get_close_matches(str(name)[:MOST_LETTERS], list(known), 1, least)), "")
+
+
+def _listed(text: str, separator: str, most: int) -> str:
+    """``short`` of a list of values, and of each of them."""
+    text = text if len(text) <= 2 * most else f"{text[:most]} ... {text[-most:]}"
+    return short(separator.join(short(part) for part in text.split(separator)), most)
 
 
 class MudgError(Exception):
     """Base of all errors raised on purpose.
+
+    Long values are cut and control characters escaped, here for all messages.
 
     Args:
         what: one sentence: what is wrong.
@@ -23,11 +64,11 @@ class MudgError(Exception):
     exit_code = 1
 
     def __init__(self, what: str, *, where: str = "", expected: str = "", got: str = "", remedy: str = "") -> None:
-        self.what = what
-        self.where = where
-        self.expected = expected
-        self.got = got
-        self.remedy = remedy
+        self.what = short(what, 300)
+        self.where = _listed(where, "/", 400)
+        self.expected = _listed(expected, ", ", 1000)
+        self.got = _listed(got, "; ", 800)
+        self.remedy = _CONTINUED.join(_listed(line, ", ", 1000) for line in remedy.split(_CONTINUED)[:100])
         super().__init__(self._text())
 
     def _text(self) -> str:

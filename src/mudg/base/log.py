@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+from mudg.base.errors import plain, plain_lines
+
 Item = TypeVar("Item")
 
 _quiet = False
@@ -30,16 +32,17 @@ def _console():
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-def _say(message: str, style: str | None = None) -> None:
-    """A message that cannot be written (stderr closed, or on a full disk) ends nothing."""
+def _say(lines: Iterable[str], style: str | None = None) -> None:
+    """Control characters and line breaks within a line are escaped. A message that cannot be written (stderr closed, or on a full
+    disk) ends nothing."""
     with contextlib.suppress(OSError, ValueError):  # ValueError: the stream is closed
-        _console().print(message, markup=False, style=style)
+        _console().print(plain_lines(lines), markup=False, style=style)
 
 
-def info(message: str) -> None:
+def info(*lines: str) -> None:
     """Say something worth knowing, once, on stderr."""
     if not _quiet:
-        _say(message)
+        _say(lines)
 
 
 def info_once(message: str) -> None:
@@ -49,16 +52,16 @@ def info_once(message: str) -> None:
         info(message)
 
 
-def warn(message: str) -> None:
+def warn(message: str, *lines: str) -> None:
     """Say that something is wrong but the work goes on."""
-    _say(f"warning: {message}", "yellow")
+    _say((f"warning: {message}", *lines), "yellow")
 
 
 class ProgressTask:
     """One running progress bar. On a terminal it is drawn; elsewhere a line is written now and then."""
 
     def __init__(self, description: str, total: int, start: int) -> None:
-        self._description = description
+        self._description = plain(description)
         self._total = total
         self._done = start
         self._text = ""
@@ -72,16 +75,16 @@ class ProgressTask:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
             self._progress = Progress(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(),
                 TimeRemainingColumn(),
-                TextColumn("{task.fields[text]}"),
+                TextColumn("{task.fields[text]}", markup=False),
                 console=console,
                 transient=False,
             )
             self._progress.start()
-            self._id = self._progress.add_task(description, total=total, completed=start, text="")
+            self._id = self._progress.add_task(self._description, total=total, completed=start, text="")
 
     def advance(self, count: int = 1) -> None:
         """Count ``count`` more items as done."""
@@ -95,7 +98,7 @@ class ProgressTask:
 
     def update(self, text: str) -> None:
         """Show ``text`` (a loss, a rate) beside the bar from the next ``advance`` on."""
-        self._text = text
+        self._text = plain(text)
 
     def close(self) -> None:
         """Stop drawing."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import functools
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -16,7 +15,7 @@ from typing import Annotated, Any, Final, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from mudg.base.errors import InputError, MudgError
+from mudg.base.errors import InputError, MudgError, nearest, short
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 """A finite number; whole numbers are accepted, texts and booleans are not."""
@@ -61,9 +60,9 @@ def refuse_unknown(names: Iterable[str], known: Collection[str]) -> None:
     """InputError for the first of ``names`` that is not ``known``, with the nearest known one."""
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            remedy = f"did you mean {near[0]!r}?" if near else "remove it"
-            raise InputError(f"unknown field {name!r}", expected=f"one of {', '.join(known)}", remedy=remedy)
+            near = nearest(name, known)
+            remedy = f"did you mean {near!r}?" if near else "remove it"
+            raise InputError(f"unknown field {short(repr(name))}", expected=f"one of {', '.join(known)}", remedy=remedy)
 
 
 class _FieldProblem(ValueError):
@@ -154,7 +153,7 @@ def first_problem(error: ValidationError, where: str, error_type: type[ErrorType
         return error_type(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=problem.remedy)
     kind = "finite_number" if kind == "float_type" and type(value) is int else kind  # a whole number beyond 1e308
     what, expected = _MEANINGS.get(kind, ("value is not valid", first["msg"].removeprefix("Input should be ")))
-    got = repr(value)[:80] + (f" (and {count - 1} more problems)" if count > 1 else "")
+    got = short(repr(value), 80) + (f" (and {count - 1} more problems)" if count > 1 else "")
     return error_type(what, where=where, expected=expected, got=got)
 
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -272,13 +273,31 @@ def _no_constants(name: str) -> Any:
     raise ValueError(f"{name} is not JSON")
 
 
+def _finite(number: str) -> None:
+    if math.isinf(float(number)):
+        raise ValueError(f"{number[:40]} is beyond what a number can be")
+
+
+_HALVES = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
+_BEYOND = re.compile(r"[eE]\+?[0-9]{3}|[0-9]{200}")
+"""What may be half a letter (a surrogate without its pair), and a number beyond floats."""
+
+
 def parse_json(text: str | bytes, where: str) -> Any:
-    """Parse strict JSON (no NaN, no duplicate keys, bounded size and nesting); InputError names ``where``."""
+    """Parse strict JSON (no NaN, no numbers beyond floats, no duplicate keys, no halves of letters, bounded size and nesting);
+    InputError names ``where``."""
     if len(text) > _MAX_JSON_BYTES:
         raise InputError("JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes",
             got=f"{len(text)}")  # fmt: skip
     try:
-        return json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constants)
+        if isinstance(text, bytes):
+            text = text.decode(json.detect_encoding(text))
+        value = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_no_constants)
+        if _HALVES.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
+        if _BEYOND.search(text):
+            json.loads(text, parse_int=_finite, parse_float=_finite)
+        return value
     except (ValueError, RecursionError) as error:
         raise InputError("not valid JSON", where=where, got=str(error) or type(error).__name__) from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from mudg.base.errors import plain_lines
 from mudg.base.types import Scene
 from mudg.methods import METHODS
 
@@ -253,7 +254,7 @@ def plain(document: Mapping[str, Any]) -> str:
             cells = [f"{text:>{width}}" for text, width in zip(found, widths, strict=True)]
             lines.append(f"  {FLOOR:<28}" + "".join(cells))
         lines.append("")
-    return "\n".join(lines).rstrip()
+    return plain_lines(lines).rstrip()
 
 
 def _has_numbers(values: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[str, Any]]) -> bool:

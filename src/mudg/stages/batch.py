@@ -217,7 +217,7 @@ def watch_status(out: str, html: bool, every_s: float) -> dict[str, Any]:
         found = show_status(out, html)
         if every_s <= 0 or not found["left"]:
             return found
-        log.info(found["text"])
+        log.info(*found["text"].splitlines())
         time.sleep(every_s)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mudg.base import memory
+from mudg.base.errors import plain_lines
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def report_machine() -> dict[str, Any]:
         lines += [f"  {name:<18} {value}" for name, value in rows.items()]
     lines.append("")
     lines += [f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]
-    return {**sections, "problems": problems, "ready": not problems, "text": "\n".join(lines)}
+    return {**sections, "problems": problems, "ready": not problems, "text": plain_lines(lines)}
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
@@ -101,7 +102,7 @@ def report_scene(scene: Path) -> dict[str, Any]:
     lines += cost_lines
     return {
         "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.message} for f in found],
-        "alignment": alignment, "presets": costs, "usable": not count["error"], "text": "\n".join(lines),
+        "alignment": alignment, "presets": costs, "usable": not count["error"], "text": plain_lines(lines),
         "exit_code": 3 if count["error"] else 0,
     }  # fmt: skip
 

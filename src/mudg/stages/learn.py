@@ -201,7 +201,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         kind.save(made, out / "model", kind.card(made, config, scores, about_data), facts)
         shutil.rmtree(out / learn_clips.CACHE, ignore_errors=True)
         directory.finish({"held_out": scores["average"]})
-        log.info(learn_score.table(scores))
+        log.info(*learn_score.table(scores).splitlines())
 
     ranks.leader_does(finish)
 
@@ -390,4 +390,4 @@ def _score_watched(
     request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
     scores = learn_score.score(made, shards, folder, request, picture=_picture(run_dir, step))
     run_dir.log(step=step, held_out=scores["average"])
-    log.info(f"step {step}\n{learn_score.table(scores)}")
+    log.info(f"step {step}", *learn_score.table(scores).splitlines())

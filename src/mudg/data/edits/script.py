@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,8 @@ import yaml
 from pydantic import ValidationError
 
 from mudg.base import store
-from mudg.base.errors import InputError
-from mudg.base.plain_yaml import parse_yaml
+from mudg.base.errors import InputError, nearest, short
+from mudg.base.plain_yaml import Lines, parse_with_lines
 from mudg.base.records import first_problem, place
 from mudg.data.edits.records import CONDITIONS, VERBS, files_of
 
@@ -106,70 +105,35 @@ def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScr
     Args:
         where: name of the file for messages. folder: what its paths are relative to.
     """
-    entries = parse_yaml(text, where)
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    if not isinstance(root, yaml.SequenceNode) or not entries:
+    entries, lines = parse_with_lines(text, where)
+    if not isinstance(entries, list) or not entries:
         raise InputError("an edit script is a list of edits", where=where, expected="lines such as `- remove: {ids: [car-003]}`",
             got="nothing" if entries in (None, []) else type(entries).__name__)  # fmt: skip
-    return EditScript(tuple(_one(node, value, where) for node, value in zip(root.value, entries, strict=True)), Path(folder))
+    return EditScript(tuple(_one(index, value, lines, where) for index, value in enumerate(entries)), Path(folder))
 
 
-def _one(node: yaml.Node, value: Any, where: str) -> ScriptEdit:
-    at = f"{where}, line {_line(node)}"
-    if not isinstance(value, dict) or len(value) != 1 or not isinstance(node, yaml.MappingNode):
+def _one(index: int, value: Any, lines: Lines, where: str) -> ScriptEdit:
+    at = f"{where}, line {lines[(index,)]}"
+    if not isinstance(value, dict) or len(value) != 1:
         raise InputError("an edit is one verb with its settings", where=at, expected="e.g. `- remove: {ids: [car-003]}`",
-            got=repr(value)[:80])  # fmt: skip
+            got=short(value, 80))  # fmt: skip
     ((verb, settings),) = value.items()
     if verb not in VERBS:
-        near = difflib.get_close_matches(str(verb), VERBS, 1)
+        near = nearest(verb, VERBS)
         raise InputError(f"there is no verb {verb!r}", where=at, expected=f"one of {', '.join(VERBS)}",
-            remedy=f"did you mean {near[0]!r}?" if near else "see docs/edit.md")  # fmt: skip
-    _refuse_doubles(node, where)
+            remedy=f"did you mean {near!r}?" if near else "see docs/edit.md")  # fmt: skip
     try:
         return ScriptEdit(verb, VERBS[verb].model_validate({} if settings is None else settings), at)
     except ValidationError as error:
         told = first_problem(error, place(verb))
-        steps = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", told.where)[1:]]
-        line = _line_at(node.value[0][1], steps, told.what) or _line(node)
+        steps = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", told.where)]
+        line = _line_at((index, *steps), lines, told.what)
         raise told.located(f"{where}, line {line}: {told.where}") from error
 
 
-def _line(node: yaml.Node) -> int:
-    return node.start_mark.line + 1
-
-
-def _line_at(node: yaml.Node, loc: Sequence[str | int], said: str) -> int | None:
+def _line_at(path: tuple[str | int, ...], lines: Lines, said: str) -> int:
     """The line of a field, of an unknown one that a message names, or of what should hold it."""
-    for step in loc:
-        inner = None
-        if isinstance(node, yaml.MappingNode):
-            inner = next((value for key, value in node.value if key.value == step), None)
-        elif isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value):
-            inner = node.value[step]
-        if inner is None:
-            break
-        node = inner
-    keys = [key for key, _ in node.value] if isinstance(node, yaml.MappingNode) else []
-    return next((_line(key) for key in keys if f"unknown field {key.value!r}" in said), _line(node))
-
-
-def _refuse_doubles(node: yaml.Node, where: str) -> None:
-    """YAML keeps the last of two equal keys without a word."""
-    for mapping in _mappings(node):
-        seen: set[str] = set()
-        for key, _ in mapping.value:
-            if key.value in seen:
-                raise InputError(f"{key.value!r} is given twice", where=f"{where}, line {_line(key)}", remedy="keep one of them")
-            seen.add(key.value)
-
-
-def _mappings(node: yaml.Node) -> Iterator[yaml.MappingNode]:
-    if isinstance(node, yaml.MappingNode):
-        yield node
-        for _, value in node.value:
-            yield from _mappings(value)
-    elif isinstance(node, yaml.SequenceNode):
-        for value in node.value:
-            yield from _mappings(value)
-
-
+    while path not in lines:
+        path = path[:-1]
+    unknown = (line for inner, line in lines.items() if inner[:-1] == path and f"unknown field {inner[-1]!r}" in said)
+    return next(unknown, lines[path])

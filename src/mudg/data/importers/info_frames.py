@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,7 +34,7 @@ def info_record(path: Path, expected: str) -> Iterator[dict[str, Any]]:
         expected: what the record must hold, for the message.
     """
     with record_fields("frame record is malformed or incomplete", path, expected):
-        yield json.loads(store.read_bytes(path))
+        yield store.read_json(path)
 
 
 def info_tracks(

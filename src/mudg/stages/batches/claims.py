@@ -23,6 +23,7 @@ from mudg.base.errors import InputError, MudgError
 from mudg.base.location import Location
 from mudg.base.processes import process_alive
 from mudg.stages.batches import retries
+from mudg.stages.batches.told import ClaimTold, checked
 
 WORKING: Final = "working"
 WAITING: Final = "waiting"
@@ -168,16 +169,15 @@ def latest(folder: Location, key: str) -> tuple[int, Mapping[str, Any] | None]:
 
 
 def read(file: Location) -> Mapping[str, Any] | None:
-    """What a claim says; None if it was removed meanwhile. One that was left empty by a crash has run out."""
+    """What a claim says; None if it was removed meanwhile. One that was left empty by a crash, or is damaged, has run out."""
     try:
         content = file.load()
     except InputError:
         return None
     try:
-        found = store.parse_json(content, str(file))
+        return checked(ClaimTold, store.parse_json(content, str(file)), str(file))
     except InputError:
         return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _vanished(record: Mapping[str, Any], owner: Owner) -> bool:

@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
@@ -21,13 +22,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from pydantic import TypeAdapter, ValidationError
+
 from mudg.base import store
 from mudg.base.config import differences
 from mudg.base.errors import InputError, UsageError
 from mudg.base.location import Location
+from mudg.base.records import first_problem
 from mudg.stages.batches.lists import BOOKKEEPING, Entry
 from mudg.stages.batches.plan import BatchPlan
+from mudg.stages.batches.told import Ended, Name, PlanTold, StepTold, checked
 
+_LISTED: Final = TypeAdapter(list[tuple[Name, str, dict[str, str]]])
 _FLUSH_S: Final = 30.0
 _BEGAN_FLUSH_S: Final = 5.0
 """What has begun is seen by others earlier than what has ended, which other records tell."""
@@ -102,34 +108,38 @@ class BatchFolder:
             listed.save(content, only_if_absent=True)
 
     def plan(self) -> dict[str, Any]:
-        """The plan's record. InputError: no batch is here."""
+        """The plan's record. InputError: no batch is here, or the record is damaged."""
         file = self.own / "plan.json"
         if not file.exists():
             raise InputError("no batch is here", where=str(self.out), expected="the --out of a mudg batch run")
-        return store.parse_json(file.load(), str(file))
+        return dict(checked(PlanTold, store.parse_json(file.load(), str(file)), str(file), "begin the batch again in another folder"))
+
+    def ended(self, file: Location) -> Mapping[str, Any]:
+        """The record of a step that is done or has failed. InputError: it is damaged."""
+        return checked(Ended, store.parse_json(file.load(), str(file)), str(file), "remove it: the step is done again")
 
     def entries(self) -> list[Entry]:
         """The scenes of all lists that were ever given, by name."""
         found: dict[str, Entry] = {}
         for name in self.own.names():
             if name.startswith("list."):
-                for scene, source, settings in store.parse_json((self.own / name).load(), name):
-                    found[scene] = Entry(scene, source, settings)
+                where = str(self.own / name)
+                try:
+                    listed = _LISTED.validate_python(store.parse_json((self.own / name).load(), where))
+                except ValidationError as error:
+                    raise first_problem(error, f"{where}: ") from error
+                found |= {scene: Entry(scene, source, settings) for scene, source, settings in listed}
         return [found[name] for name in sorted(found)]
 
     # events ------------------------------------------------------------------------------------------------------------
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """All events of all workers; a line that a crash cut off is left out."""
+        """All events of all workers; a line that a crash cut off, or that is no event, is left out."""
         folder = self.own / "events"
         for name in folder.names():
             for line in (folder / name).load().splitlines():
-                try:
-                    found = json.loads(line)
-                except ValueError:
-                    continue
-                if isinstance(found, dict):
-                    yield found
+                with contextlib.suppress(InputError):
+                    yield checked(StepTold, store.parse_json(line, name), name)
 
 
 @dataclass

@@ -19,7 +19,7 @@ from typing import Any, Final
 from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, UsageError, plain
 from mudg.base.location import Location
 from mudg.base.run_folder import refuse_overlaps
 from mudg.stages.batches.folders import BatchFolder
@@ -172,7 +172,9 @@ def _finished(folder: Path) -> str:
 
 
 def _contents(folder: Path) -> str:
-    summary = _state(folder).get("summary", {})
+    summary = _state(folder).get("summary")
+    if not isinstance(summary, Mapping):
+        return ""
     return ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str))
 
 
@@ -185,7 +187,7 @@ def table(verb: str, outcomes: Sequence[Outcome]) -> str:
     for column in ("scene", "state", "seconds", "what it holds, or why it failed"):
         grid.add_column(column, overflow="fold", justify="right" if column == "seconds" else "left")
     for outcome in sorted(outcomes, key=lambda o: o.state == "failed"):
-        grid.add_row(outcome.name, outcome.state, f"{outcome.seconds:.1f}", outcome.words)
+        grid.add_row(outcome.name, outcome.state, f"{outcome.seconds:.1f}", plain(outcome.words))
     out = io.StringIO()
     Console(file=out, width=int(os.environ.get("COLUMNS") or 120), markup=False, highlight=False).print(grid)
     failed = sum(outcome.state == "failed" for outcome in outcomes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import math
@@ -48,9 +49,12 @@ class Bound:
         method, _, metric = self.path.rpartition(".")
         for name in _SCORES:
             scores = _json(folder / name)
-            for row in scores.get("by_distance", []) if isinstance(scores, Mapping) else []:
-                if row.get("method") == method and abs(float(row.get("distance_m", math.inf)) - self.distance_m) < 1e-6:
-                    return _number(row.get("values", {}).get(metric))
+            try:
+                for row in scores.get("by_distance", []) if isinstance(scores, Mapping) else []:
+                    if row.get("method") == method and abs(float(row.get("distance_m", math.inf)) - self.distance_m) < 1e-6:
+                        return _number(row.get("values", {}).get(metric))
+            except (AttributeError, TypeError, ValueError) as error:
+                raise InputError("the scores of a result cannot be read", where=str(folder / name), got=str(error)) from error
         return None
 
     def problem(self, folder: Path) -> str:
@@ -110,7 +114,13 @@ def digest_of(folder: Path) -> str:
 
 def facts_of(folder: Path) -> dict[str, Any]:
     """Facts about the log that a result holds a scene of: cameras, images, seconds and metres driven, objects by class. Empty where there
-    is none."""
+    is none that can be read."""
+    with contextlib.suppress(AttributeError, TypeError, ValueError):  # any command may have made it
+        return _facts_of(folder)
+    return {}
+
+
+def _facts_of(folder: Path) -> dict[str, Any]:
     for scene in (folder, folder / "scene"):
         index = _json(scene / "scene.json")
         if not isinstance(index, Mapping) or "frames" not in index:
@@ -142,13 +152,13 @@ def _length(poses: Any) -> float:
 def spent_of(folder: Path) -> dict[str, Any]:
     """What the record of a run says that it took: of a chain, by step."""
     state = _json(folder / store.RUN_STATE)
-    if not isinstance(state, Mapping):
-        return {}
-    steps = state.get("steps")
-    if isinstance(steps, Mapping):
-        peaks = [int(one["peak_bytes"]) for one in steps.values() if one.get("peak_bytes")]
-        return {"peak_bytes": max(peaks, default=None), "steps": {name: float(one.get("seconds", 0.0)) for name, one in steps.items()}}
-    return {"peak_bytes": state.get("peak_bytes")}
+    with contextlib.suppress(AttributeError, TypeError, ValueError):  # any command may have made it
+        steps = state.get("steps")
+        if isinstance(steps, Mapping):
+            peaks = [int(one["peak_bytes"]) for one in steps.values() if one.get("peak_bytes")]
+            return {"peak_bytes": max(peaks, default=None), "steps": {name: float(one.get("seconds", 0.0)) for name, one in steps.items()}}
+        return {"peak_bytes": None if state.get("peak_bytes") is None else int(state["peak_bytes"])}
+    return {}
 
 
 def _json(path: Path) -> Any:

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.errors import InputError, MudgError, UsageError, plain_lines
 from mudg.base.location import Location
 from mudg.stages.batches.folders import BatchFolder, EventLog
 from mudg.stages.batches.lists import REVIEW
+from mudg.stages.batches.told import ReviewTold, checked
 
 PICTURES: Final = 4
 """Most pictures of a result."""
@@ -126,16 +127,11 @@ def waiting(folder: BatchFolder) -> list[Candidate]:
         file = reviews_of(folder) / name / _RECORD
         if name == _PAGE or not file.exists():  # the record comes last
             continue
-        record = store.parse_json(file.load(), str(file))
-        try:
-            found.append(Candidate(
-                str(record["scene"]), str(record["stage"]), str(record["key"]), tuple(map(str, record["problems"])), str(record["place"]),
-                tuple(str(one) for one in record["pictures"] if "/" not in str(one)), str(record.get("report", "")),
-            ))  # fmt: skip
-        except (KeyError, TypeError) as error:
-            raise InputError(
-                "a record is malformed", where=str(file), got=f"no {error}", remedy="remove its folder"
-            ) from error
+        record = checked(ReviewTold, store.parse_json(file.load(), str(file)), str(file), "remove its folder")
+        found.append(Candidate(
+            record["scene"], record["stage"], record["key"], tuple(record["problems"]), record["place"],
+            tuple(one for one in record["pictures"] if "/" not in one), record.get("report", ""),
+        ))  # fmt: skip
     return found
 
 
@@ -181,7 +177,7 @@ def judge(folder: BatchFolder, names: Sequence[str], accepted: bool) -> list[Can
 
 def _decide(folder: BatchFolder, one: Candidate, accepted: bool, events: EventLog) -> None:
     file = folder.failed(one.key)
-    record = dict(store.parse_json(file.load(), str(file)))
+    record = dict(folder.ended(file))
     if not accepted:
         file.save(store.json_text({**record, "reviewed": True}, indent=None).encode())
         return
@@ -204,7 +200,7 @@ def text_of(found: Sequence[Candidate], out: str) -> str:
     """What waits, for a terminal."""
     lines = [f"{one.scene} {one.stage}: {'; '.join(one.problems)}" for one in found]
     ways = f"mudg batch accept {out} --scenes NAME ..., reject likewise, or mudg batch retry {out} --reason quality"
-    return "\n".join([*lines, f"{len(found)} results wait for review", *([ways] if found else [])])
+    return plain_lines([*lines, f"{len(found)} results wait for review", *([ways] if found else [])])
 
 
 def write_page(folder: BatchFolder, found: Sequence[Candidate]) -> Location:

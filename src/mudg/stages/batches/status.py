@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from mudg.base import store
-from mudg.base.errors import InputError
+from mudg.base.errors import plain
 from mudg.base.memory import in_words
 from mudg.stages.batches import claims, quality, retries, review
 from mudg.stages.batches.folders import BatchFolder
@@ -158,7 +157,7 @@ def read_status(folder: BatchFolder) -> BatchStatus:
     """Read the state of a batch.
 
     Raises:
-        InputError: no batch is there.
+        InputError: no batch is there, or a record of it is damaged.
     """
     plan = folder.plan()
     names = [str(one["name"]) for one in plan["stages"]]
@@ -256,11 +255,10 @@ def _note_failure(state: BatchStatus, key: str, record: Mapping[str, Any], kind:
 
 
 def _fold_record(state: BatchStatus, folder: BatchFolder, key: str, is_done: bool, told: set[str]) -> None:
-    try:
-        file = folder.done(key) if is_done else folder.failed(key)
-        record = store.parse_json(file.load(), str(file))
-    except InputError:
+    file = folder.done(key) if is_done else folder.failed(key)
+    if not file.exists():  # tried again meanwhile
         return
+    record = folder.ended(file)
     told.add(key)
     if is_done:
         _add_done(state, record)
@@ -312,7 +310,7 @@ def text_of(state: BatchStatus) -> str:
     console = Console(file=out, width=120, markup=False, highlight=False)
     console.print(grid)
     for words, count, example in state.reasons()[:_SHOWN]:
-        out.write(f"{count:7d} x {words}  (e.g. {example})\n")
+        out.write(f"{count:7d} x {plain(words)}  (e.g. {plain(example)})\n")
     if state.for_review:
         out.write(f"{state.for_review} results wait for review: mudg batch review {state.out}\n")
     out.write(

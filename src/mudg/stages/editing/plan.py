@@ -6,7 +6,6 @@ what is done to a path as functions, to be applied to either.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.errors import InputError, MudgError, UsageError, nearest
 from mudg.base.types import PointCloud, Scene, View
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
@@ -437,10 +436,10 @@ _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
 def _actor(world: EditWorld, name: str) -> Actor:
     if name in world.actors:
         return world.actors[name]
-    near = difflib.get_close_matches(name, world.actors, 1)
+    near = nearest(name, world.actors)
     known = ", ".join(list(world.actors)[:20]) + (", ..." if len(world.actors) > 20 else "")
     raise InputError("there is no object of this id", where="id", expected=f"ego, or one of {known or 'none'}", got=name,
-        remedy=f"did you mean {near[0]!r}?" if near else "tracks.json of the scene lists them")  # fmt: skip
+        remedy=f"did you mean {near!r}?" if near else "tracks.json of the scene lists them")  # fmt: skip
 
 
 def _motion(world: EditWorld, name: str) -> Motion:

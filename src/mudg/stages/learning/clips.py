@@ -211,7 +211,7 @@ def open_streamed(
         data = replace(data, width=round(data.width / multiple) * multiple, height=round(data.height / multiple) * multiple)
     rules = _log_rules(config, (data.width, data.height), 0, points_alone)
     scenes = read_list(data.scenes[0], data.held_out)
-    log.info(f"learn: {data.scenes[0]}: {scenes.summary()}")
+    log.info(*f"learn: {data.scenes[0]}: {scenes.summary()}".splitlines())
     return replace(config, data=data), ListedShards(scenes, cache, rules, data.bad_scenes)
 
 

@@ -38,6 +38,8 @@ from mudg.data.clips.sources import FolderOfShards, ShardCache, read_present
 from mudg.data.scene import read_scene
 
 SUFFIXES: Final = (".yaml", ".yml", ".json", ".txt")
+LARGEST_LIST: Final = 4_000_000
+"""Bytes of a list in YAML; one in JSON, or of plain lines, may be larger."""
 SPAN: Final = 100_000_000
 """Shard k of the list's n-th scene has the number n * SPAN + k + 1."""
 _OPEN: Final = 512
@@ -126,7 +128,7 @@ def read_list(text: str, held_out: int = 0) -> SceneList:
     content = Location.of(text).load()
     if suffix == ".txt":
         return SceneList(_plain_lines(content, text), {}, held_out, text)
-    value = store.parse_json(content, text) if suffix == ".json" else plain_yaml.parse_yaml(content, text)
+    value = store.parse_json(content, text) if suffix == ".json" else plain_yaml.parse_yaml(content, text, LARGEST_LIST)
     listed = parse_record(_Listed, {"scenes": value} if isinstance(value, list) else value, f"{text}: ")
     return SceneList(listed.scenes, listed.data_sets, held_out, text)
 
@@ -216,7 +218,7 @@ class ListedShards:
             if number not in self.bad:
                 self.bad[number] = str(error)
                 what = "a scene is" if number % SPAN == 0 else "clips of a scene are"
-                log.warn(f"learn: {what} left out: {scenes[number // SPAN].path}\n{error}")
+                log.warn(f"learn: {what} left out: {scenes[number // SPAN].path}", *str(error).splitlines())
             count = len({bad // SPAN for bad in self.bad})
         most = int(self._limit * len(scenes))
         if count > most or count == len(scenes):

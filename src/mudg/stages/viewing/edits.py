@@ -13,6 +13,7 @@ from pydantic import Field
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.plain_yaml import LARGEST_BYTES
 from mudg.base.records import StrictRecord
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import Motion
@@ -30,7 +31,6 @@ from mudg.stages.editing.runs import find_run
 MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
 """First line of a saved script; a file without it belongs to somebody else."""
 NAME: Final = "edits.yaml"
-MOST_LETTERS: Final = 1_000_000
 SEALED: Final = (store.MANIFEST, "run.json", "model.json")
 """A folder that holds one of these is the result of a command: nothing is added to it."""
 KEPT: Final = 2
@@ -51,7 +51,7 @@ class EditFiles:
 class EditRequest(StrictRecord):
     """A script, as ``assets/viewer/edits.js`` writes it; ``save`` also writes the file."""
 
-    script: Annotated[str, Field(max_length=MOST_LETTERS)]
+    script: Annotated[str, Field(max_length=LARGEST_BYTES)]
     save: bool = False
 
 
@@ -115,9 +115,9 @@ class EditDesk:
 
     def _carried(self, text: str) -> EditedDrive:
         """A script carried out on all but the fits; quick."""
+        script = parse_edits(text, NAME)  # others need not wait while a long text is read
         with self._lock:
             if text not in self._planned:
-                script = parse_edits(text, NAME)
                 known = (
                     {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
                 )

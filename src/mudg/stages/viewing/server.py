@@ -1,25 +1,49 @@
-"""A small web server for one page on this machine. It serves names from a table, never paths, and answers only to its own page."""
+"""A small web server for one page on this machine. It serves names from a table, never paths, and answers only to its own page.
+
+Whoever reaches the port may send anything, with or without the token: what cannot be read is answered with 400 or not at all, who says
+nothing is cut off, and there are never more than `MOST_CONNECTIONS`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hmac
 import ipaddress
+import math
 import os
+import re
 import secrets
+import socket
+import socketserver
+import sys
+import threading
+import time
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-from mudg.base import log, store
+from mudg.base import failures, log, store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 
 MOST_BYTES: Final = 8 * 2**20
 """Of a request's body."""
 COOKIE: Final = "mudg_token"
+MOST_CONNECTIONS: Final = 64
+HEADERS_S: Final = 30.0
+"""Until a connection has sent the head of its next request."""
+BODY_S: Final = 120.0
+SILENT_S: Final = 30.0
+"""Until a connection takes or sends anything at all."""
+PAUSE_S: Final = 0.2
+"""Before connections are accepted again that the system has refused."""
+_PIECE: Final = 2**16
+_NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+_LENGTH: Final = re.compile(r"[0-9]{1,9}")
 Answer = Callable[[Any], tuple[bytes, str]]
 """From a JSON value to content and its type."""
 Stream = Callable[[Any, Callable[[bytes], None]], None]
@@ -64,23 +88,93 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def open_server(site: Site, host: str, port: int) -> ThreadingHTTPServer:
+class SiteServer(ThreadingHTTPServer):
+    """Answers each connection in a thread. Those that only wait are cut off when they are late, or when others need their room."""
+
+    request_queue_size = MOST_CONNECTIONS
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        self._lock = threading.Lock()
+        self._until: dict[socket.socket, float] = {}
+        """Connections -> when their patience ends; infinity while they are answered."""
+        super().__init__(address, handler)
+
+    def server_bind(self) -> None:
+        """Without the look-up of the machine's name that http.server makes, which may ask the network."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
+
+    def wait_for(self, connection: socket.socket, seconds: float) -> None:
+        """Let a connection be cut off after so long."""
+        with self._lock:
+            self._until[connection] = time.monotonic() + seconds
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """The next connection; where the system has no room for it, half of those that wait make room, and nothing spins."""
+        try:
+            return super().get_request()
+        except OSError as error:
+            if error.errno in _NO_ROOM:
+                self._make_room(len(self._until) // 2 + 1)
+                time.sleep(PAUSE_S)
+            raise
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Begin to answer a connection, or close it where all others are being answered."""
+        full = len(self._until) >= MOST_CONNECTIONS
+        if full and not self._make_room(1):
+            self.shutdown_request(request)
+            return
+        self.wait_for(request, HEADERS_S)
+        super().process_request(request, client_address)
+
+    def _make_room(self, count: int) -> bool:
+        """Cut off so many of the connections that wait, those first whose patience ends first; whether any was."""
+        with self._lock:
+            waiting = sorted((one for one, until in self._until.items() if until < math.inf), key=self._until.__getitem__)
+            self._cut_off(waiting[:count])
+            return bool(waiting)
+
+    def service_actions(self) -> None:
+        """Twice a second: cut off who is late."""
+        with self._lock:
+            self._cut_off([one for one, until in self._until.items() if until < time.monotonic()])
+
+    def _cut_off(self, connections: Sequence[socket.socket]) -> None:
+        for connection in connections:
+            del self._until[connection]
+            with contextlib.suppress(OSError):  # it has ended already
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def close_request(self, request: Any) -> None:
+        """Forget a connection."""
+        with self._lock:
+            self._until.pop(request, None)
+        super().close_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """What went wrong, in words; nothing about connections that ended."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError | TimeoutError):
+            log.warn(f"viewer: a request could not be answered: {type(error).__name__}: {error}")
+
+
+def open_server(site: Site, host: str, port: int) -> SiteServer:
     """A server that listens; ``serve_forever`` is the caller's.
 
     Raises:
         ResourceError: the port is taken, or the address is none of this machine.
     """
     try:
-        server = ThreadingHTTPServer((host, port), type("OwnSiteRequest", (SiteRequest,), {"site": site}))
-    except OSError as error:
+        return SiteServer((host, port), type("OwnSiteRequest", (SiteRequest,), {"site": site}))
+    except (OSError, OverflowError, UnicodeError) as error:  # a port, a name that cannot be
         raise ResourceError(
             "cannot listen", where=f"{host}:{port}", got=str(error), remedy="choose another --port"
         ) from error
-    server.daemon_threads = True
-    return server
 
 
-def address_of(server: ThreadingHTTPServer, site: Site) -> str:
+def address_of(server: SiteServer, site: Site) -> str:
     """Address of the page."""
     host, port = server.server_address[:2]
     return f"http://{host!s}:{port}/?token={site.token}"
@@ -107,12 +201,18 @@ class SiteRequest(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "mudg"
     sys_version = ""
+    timeout = SILENT_S
+    server: SiteServer
+
+    def handle_one_request(self) -> None:
+        """Read one request in the time that it has, and answer it."""
+        self.server.wait_for(self.connection, HEADERS_S)
+        super().handle_one_request()
 
     def do_GET(self) -> None:
         """A file of the site."""
-        parts = urlsplit(self.path)
-        name = parts.path.removeprefix("/")
-        if self._refused(parse_qs(parts.query)):
+        name = self._name()
+        if name is None:
             return
         content = self.site.files.get(name)
         if content is None:
@@ -122,13 +222,12 @@ class SiteRequest(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """JSON to one of the site's answers."""
-        parts = urlsplit(self.path)
-        name = parts.path.removeprefix("/")
-        answer, stream = self.site.answers.get(name), self.site.streams.get(name)
-        origin = self.headers.get("Origin")
-        if self._refused(parse_qs(parts.query)):
+        name = self._name()
+        if name is None:
             return
-        if origin is None or urlsplit(origin).netloc != self.headers.get("Host"):
+        answer, stream = self.site.answers.get(name), self.site.streams.get(name)
+        host = self.headers.get("Host")
+        if self.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
             self._answer(HTTPStatus.FORBIDDEN, b"a request from another page")
         elif answer is None and stream is None:
             self._answer(HTTPStatus.NOT_FOUND, b"no such question")
@@ -138,21 +237,34 @@ class SiteRequest(BaseHTTPRequestHandler):
             self._answer_json(answer, stream)
 
     def _answer_json(self, answer: Answer | None, stream: Stream | None) -> None:
-        length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > MOST_BYTES:
+        lengths = self.headers.get_all("Content-Length", [])
+        if len(lengths) != 1 or not _LENGTH.fullmatch(lengths[0]) or "Transfer-Encoding" in self.headers:
+            self._answer(HTTPStatus.BAD_REQUEST, b"the request does not say how long it is")
+            return
+        length = int(lengths[0])
+        if length > MOST_BYTES:
             self._answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"the request is too large")
             return
         sent: list[int] = []
+        self.server.wait_for(self.connection, BODY_S)
+        body = self.rfile.read(length)
+        if len(body) < length:  # cut off
+            self.close_connection = True
+            return
+        self.server.wait_for(self.connection, math.inf)
         try:
-            asked = store.parse_json(self.rfile.read(int(length)), "request")
+            asked = store.parse_json(body, "request")
             if answer is not None:
                 self._answer(HTTPStatus.OK, *answer(asked))
             elif stream is not None:
                 stream(asked, lambda content: self._send(content, sent))
-        except ConnectionError:  # the page was closed, or wants it no more
+        except (ConnectionError, TimeoutError):  # the page was closed, or wants it no more
             self.close_connection = True
-        except MudgError as error:
-            self._tell(error, begun=bool(sent))
+        except Exception as error:
+            told = failures.in_words(error)
+            if told is None:
+                raise
+            self._tell(told, begun=bool(sent))
 
     def _tell(self, error: MudgError, begun: bool) -> None:
         """Answer with a problem; after the first piece of a stream, as a line of it."""
@@ -168,7 +280,24 @@ class SiteRequest(BaseHTTPRequestHandler):
             self.close_connection = True
             self._head(HTTPStatus.OK, {"Content-Type": TYPES["bin"], "Connection": "close"})
         sent.append(len(content))
-        self.wfile.write(content)
+        self._write(content)
+
+    def _write(self, content: bytes) -> None:
+        """Send in pieces, each of which has its time."""
+        for begin in range(0, len(content), _PIECE):
+            self.wfile.write(content[begin : begin + _PIECE])
+
+    def _name(self) -> str | None:
+        """What is asked for; None if the request was refused: it cannot be read, or must not be answered."""
+        self.server.wait_for(self.connection, math.inf)
+        if self.command != "POST" and ("Content-Length" in self.headers or "Transfer-Encoding" in self.headers):
+            self.close_connection = True  # what follows is left unread
+        try:
+            parts = urlsplit(self.path)
+        except ValueError:
+            self._answer(HTTPStatus.BAD_REQUEST, b"no address")
+            return None
+        return None if self._refused(parse_qs(parts.query)) else parts.path.removeprefix("/")
 
     def _refused(self, query: Mapping[str, list[str]]) -> bool:
         """Whether the request was refused: another name for this server (a page elsewhere whose name was pointed here), or no token."""
@@ -198,7 +327,7 @@ class SiteRequest(BaseHTTPRequestHandler):
             self.close_connection = True  # a body may be left unread
             named["Connection"] = "close"
         self._head(status, named)
-        self.wfile.write(content)
+        self._write(content)
 
     def _head(self, status: HTTPStatus, named: Mapping[str, str]) -> None:
         self.send_response(status)

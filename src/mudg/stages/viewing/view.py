@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from http.server import ThreadingHTTPServer
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -36,7 +35,7 @@ from mudg.stages.editing.weathered import SEED
 from mudg.stages.fitting.storage import load_model, model_of_scene
 from mudg.stages.viewing.edits import EditFiles, EditRequest, desk_for
 from mudg.stages.viewing.frames import LAYERS, FrameRequest, FrameSource, VideoRequest
-from mudg.stages.viewing.server import Answer, Site, Stream, address_of, open_server, show, token_for
+from mudg.stages.viewing.server import Answer, Site, SiteServer, Stream, address_of, open_server, show, token_for
 
 MEGABYTE: Final = 1e6
 NAMES: Final = {"mudg_s": "with diffusion", "street_gaussians": "without diffusion"}
@@ -307,7 +306,7 @@ def run_view(
 
 def server_of(
     config: ViewConfig, run: Path, compare: Path | None, scene: Path | None, files: EditFiles | None = None
-) -> tuple[ThreadingHTTPServer, Site]:
+) -> tuple[SiteServer, Site]:
     """The server of a run's page, listening, and what it serves."""
     token = token_for(config.host, config.token)
     shown = find_shown(config, run, scene, compare)
