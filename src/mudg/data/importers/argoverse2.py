@@ -30,7 +30,7 @@ from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.columns import Columns, arrow_files, finite_columns, require_columns
+from mudg.data.importers.columns import Columns, arrow_files, finite_columns, require_columns, returns_of
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.data.importers.layout import (
     LogFiles,
@@ -57,6 +57,7 @@ CAMERAS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
+_LOWER: Final = "down_lidar"
 NANOSECONDS: Final = 10**9
 _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
@@ -158,9 +159,10 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
         for stamp, path in found.items()
     ]
     upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
+    places = [pose[:3, 3] for name, pose in mounts.items() if name in (_UPPER, _LOWER)]
     sweeps = [
         SweepRecord(
-            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper)
+            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper, places)
         )
         for t, path in scans.items()
     ]
@@ -279,14 +281,18 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     return tracks.tracks()
 
 
-def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:
+def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()) -> SweepPoints:
     """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
+
+    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it, f64[3] each.
 
     Raises:
         InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
     """
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
+    returns = returns_of(columns, where, places)
+    columns = {name: values[returns] for name, values in columns.items()}
     xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
     intensity = finite_columns(columns, ("intensity",), where)[:, 0]
     offset_ns = columns["offset_ns"]
@@ -301,4 +307,4 @@ def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:
             got=f"{intensity.min():g} to {intensity.max():g}")  # fmt: skip
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
-    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s)
+    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s, no_returns=int((~returns).sum()))

@@ -33,6 +33,8 @@ from mudg.base.geometry import (
     yaw_of,
 )
 from mudg.base.types import EgoPath
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scene import motion
 
 Item = TypeVar("Item")
 Matrix = NDArray[np.float64]
@@ -258,10 +260,15 @@ def pose_near(
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
 
     Raises:
-        InputError: more than ``max_beyond_s`` outside.
+        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess (``motion.gap_at``).
     """
     inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
     if inside is not None:
+        gap = motion.gap_at(ego, time_s)
+        if gap is not None:
+            raise InputError("vehicle poses have a gap here", where=where, got=f"at {time_s:.3f} s: {gap}",
+                expected="poses around every image and scan",
+                remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps")  # fmt: skip
         return inside
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
@@ -278,6 +285,44 @@ def pose_near(
     back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
     end = ego.world_from_ego[near]
     return end if back is None else end @ invert(back) @ end
+
+
+def has_pose(ego: EgoPath, time_s: float) -> bool:
+    """Whether ``pose_near`` has a pose at a time."""
+    try:
+        pose_near(ego, time_s)
+    except InputError:
+        return False
+    return True
+
+
+def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPath:
+    """The vehicle's path with headings that flip by 180 degrees turned back and, if that is asked for, its gaps bridged.
+
+    Args:
+        options: ``bridge_gaps`` is used.
+        notes: what was done is added.
+    """
+    poses, turned = motion.unflipped(ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S)
+    if len(turned):
+        ego = EgoPath(ego.times_s, poses)
+        notes.append(
+            f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {len(turned)} of {len(poses)} poses were "
+            "turned back"
+        )
+    found = motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []
+    if found:
+        longest = max(found, key=lambda gap: gap.moved_m)
+        notes.append(f"{len(found)} gaps of the vehicle's path are bridged by curves, the longest: {longest}")
+        ego = motion.bridged(ego)
+    return ego
+
+
+def origin_note(map_from_ego: Matrix) -> str:
+    """A note that says where the scene's world lies in the data set's: its origin is the first vehicle pose, subtracted in float64."""
+    x, y, z = (float(value) for value in map_from_ego[:3, 3])
+    turn = yaw_of(map_from_ego)
+    return f"the world's origin is ({x:.3f}, {y:.3f}, {z:.3f}) m in the data set's world, its x axis turned by {turn:.6f} rad"
 
 
 def world_from_first(map_from_ego: Matrix) -> Matrix:

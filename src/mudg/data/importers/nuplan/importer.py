@@ -18,6 +18,7 @@ middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offli
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,7 @@ from mudg.data.importers.images import ImageFit, brown_conrady, fit_images, imag
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
 from mudg.data.importers.nuplan.database import NuplanCamera, NuplanCloud, NuplanLog, open_log
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.returns import near_places
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
@@ -219,7 +221,7 @@ def _moments(
     shots: Sequence[_Shot], names: Sequence[str], options: ImportOptions, where: str
 ) -> tuple[list[list[_Shot]], list[str]]:
     """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
-    groups = _by_moment(shots, names)
+    groups = _by_moment(shots, names, where)
     missing = [shot.file for group in groups for shot in group if not shot.file.is_file()]
     _refuse_missing("camera image", missing, len(shots), options)
     complete = [{shot.channel for shot in group} == set(names) for group in groups]
@@ -237,13 +239,19 @@ def _moments(
     return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
 
-def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]]:
+def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list[list[_Shot]]:
     """Images put together by time, in order of time.
 
     Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the camera
     that has most of them, after its own camera's median delay is taken off. What lies half a period from all is alone.
     """
     by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
+    for name, found in by_camera.items():
+        for shot, following in itertools.pairwise(found):
+            if shot.time_us == following.time_us:
+                raise InputError("two images of one camera have the same time", where=f"{where}: image at {shot.time_us}",
+                    expected="a row for every image", got=f"{name}: {shot.file.name} and {following.file.name}",
+                    remedy="are rows of the table doubled? copy the file again")  # fmt: skip
     leading = max(by_camera.values(), key=len)
     if not leading:
         return []
@@ -287,7 +295,7 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
         if isinstance(what, NuplanCloud):
             time_s, path = (what.time_us - start_us) / 1e6, what.file
             yield SceneSweep(
-                SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path), str(path)
+                SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path, what.places), str(path)
             )
             return
         for shot in what:
@@ -337,8 +345,11 @@ def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
     return fit_images(recorded, options, lens)
 
 
-def _read_points(path: Path) -> SweepPoints:
+def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:
+    """A merged cloud; zeros of the LiDARs that were merged lie at their ``places``, f64[3] each."""
     cloud = read_cloud(path)
-    intensity = cloud.fields.get("intensity")
-    grey = np.zeros(len(cloud.xyz)) if intensity is None else np.clip(intensity.astype(np.float64) / 255, 0, 1)
-    return SweepPoints(cloud.xyz.astype(np.float32), grey.astype(np.float32), np.zeros(len(cloud.xyz), np.float32))
+    intensity = cloud.fields.get("intensity", np.zeros(len(cloud.xyz)))
+    returns = ~near_places(cloud.xyz, places)
+    xyz, grey = cloud.xyz[returns].astype(np.float32), np.clip(intensity[returns].astype(np.float64) / 255, 0, 1)
+    no_returns = cloud.missing + int((~returns).sum())
+    return SweepPoints(xyz, grey.astype(np.float32), np.zeros(len(xyz), np.float32), no_returns=no_returns)
