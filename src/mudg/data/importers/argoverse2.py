@@ -147,7 +147,11 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
         folder / "city_SE3_egovehicle.feather",
         folder / "calibration" / "egovehicle_SE3_sensor.feather",
     )
-    mounts, ego = read_mounts(mount_file), read_ego(ego_file, zero_ns)
+    notes: list[str] = []
+    mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
+    if options.skip_missing:
+        files = {name: _with_poses(found, ego, zero_ns, name) for name, found in files.items()}
+        scans = _with_poses(scans, ego, zero_ns, SENSOR)
 
     def map_from_ego(stamp: int) -> Matrix:
         return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, str(ego_file))
@@ -166,8 +170,8 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
         )
         for t, path in scans.items()
     ]
-    notes = [] if sweeps else ["no LiDAR sweeps in the log"]
-    tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns)
+    notes += [] if sweeps else ["no LiDAR sweeps in the log"]
+    tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns, skip_missing=options.skip_missing)
     cameras = read_cameras(folder / "calibration" / "intrinsics.feather", chosen)
     source = Source("argoverse2", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
@@ -181,6 +185,14 @@ def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     )
     common.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
     return dict(found)
+
+
+def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: str) -> dict[int, Path]:
+    """The files at whose times the vehicle's path is known."""
+    placed = {t: path for t, path in files.items() if common.has_pose(ego, (t - zero_ns) / NANOSECONDS, _POSE_SLACK_S)}
+    if len(placed) < len(files):
+        log.warn(f"argoverse2: left out {len(files) - len(placed)} files of {sensor} without a vehicle pose")
+    return placed
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------
@@ -258,8 +270,8 @@ def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
     return cameras
 
 
-def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], list[str]]:
-    """Tracks in the city's frame, and notes; no file is no tracks."""
+def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = False) -> tuple[list[Track], list[str]]:
+    """Tracks in the city's frame, and notes; no file is no tracks. ``skip_missing`` leaves out boxes without a vehicle pose."""
     where = str(path)
     if not path.is_file():
         return [], ["no annotations in this log: everything counts as static"]
@@ -268,10 +280,14 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     stamps, poses = _stamps(columns, where), _poses(columns, where)
     sizes = finite_columns(columns, ("length_m", "width_m", "height_m"), where)
     map_from_ego = {
-        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where) for t in set(stamps)
+        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where)
+        for t in set(stamps)
+        if not skip_missing or common.has_pose(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S)
     }
     tracks = BoxTracks(where, LABELS)
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        if int(stamp) not in map_from_ego:
+            continue
         label = tracks.label_of(str(columns["category"][row]))
         length, width, height = sizes[row].tolist()
         time_s = (int(stamp) - zero_ns) / NANOSECONDS

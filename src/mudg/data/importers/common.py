@@ -266,15 +266,14 @@ def pose_near(
     if inside is not None:
         gap = motion.gap_at(ego, time_s)
         if gap is not None:
-            raise InputError("vehicle poses have a gap here", where=where, got=f"at {time_s:.3f} s: {gap}",
-                expected="poses around every image and scan",
-                remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps")  # fmt: skip
+            raise gap_problem(gap, time_s, where)
         return inside
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
     if beyond > max_beyond_s:
         raise InputError("vehicle poses do not cover the images and scans", where=where, got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame", remedy="is the pose file cut off, or of another log?")  # fmt: skip
+            expected="poses from the first to the last frame",
+            remedy="are the clocks the same? is the file cut off, or of another log? --skip-missing leaves such records out")  # fmt: skip
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]
     near, far = (0, 1) if first else (-1, -2)
@@ -287,10 +286,17 @@ def pose_near(
     return end if back is None else end @ invert(back) @ end
 
 
-def has_pose(ego: EgoPath, time_s: float) -> bool:
+def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
+    """The error about an image or scan in a gap of the vehicle's path."""
+    return InputError("vehicle poses have a gap here", where=where, got=f"at {time_s:.3f} s: {gap}",
+        expected="poses around every image and scan",
+        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps")  # fmt: skip
+
+
+def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> bool:
     """Whether ``pose_near`` has a pose at a time."""
     try:
-        pose_near(ego, time_s)
+        pose_near(ego, time_s, max_beyond_s)
     except InputError:
         return False
     return True

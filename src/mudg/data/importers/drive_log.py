@@ -24,10 +24,10 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers.box_times import REACH_S, BoxTimes, clip_track, reach_images
 from mudg.data.importers.box_tracks import turned_back
-from mudg.data.importers.common import check_motion, for_each, nearest_index, origin_note, world_from_first
+from mudg.data.importers.common import check_motion, for_each, gap_problem, nearest_index, origin_note, world_from_first
 from mudg.data.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.scene import SceneWriter
+from mudg.data.scene import SceneWriter, motion
 from mudg.data.scene.returns import FLOAT32_SPACING_M, at_sensor, float32_spacing_m
 
 Matrix = NDArray[np.float64]
@@ -273,7 +273,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
         InputError: a file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``.
     """
     check_motion(drive.ego, drive.where)
-    chosen = _without_missing(_choose_frames(drive, options), options)
+    chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted((*chosen.images, *chosen.sweeps), key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
     numbers = _numbers_in_time_order(records)
@@ -381,6 +381,19 @@ def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
     log.warn(f"left out files that are missing: {lacks}")
     images = {image: number for image, number in chosen.images.items() if image not in absent}
     return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in absent])
+
+
+def _outside_gaps(chosen: _Chosen, drive: DriveLog, options: ImportOptions) -> _Chosen:
+    """Refuse records in gaps of the vehicle's path, or leave them out and say so."""
+    guessed = {record: gap for record in (*chosen.images, *chosen.sweeps) if (gap := motion.gap_at(drive.ego, record.time_s))}
+    if not guessed:
+        return chosen
+    record, gap = next(iter(guessed.items()))
+    if not options.skip_missing or not set(chosen.images) - set(guessed):
+        raise gap_problem(gap, record.time_s, _place(record))
+    log.warn(f"left out {len(guessed)} images and sweeps in gaps of the vehicle's path; the first: {gap}")
+    images = {image: number for image, number in chosen.images.items() if image not in guessed}
+    return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in guessed])
 
 
 def check_sensor_times(drive: DriveLog) -> None:

@@ -39,8 +39,8 @@ _SAME_RANGE_POINTS: Final = 50
 
 
 WITHOUT_LIDAR: Final = (
-    "no LiDAR sweeps: there is nothing to fuse, so `mudg fuse` and `mudg run`, and what needs a fused cloud (fit, synthesize), refuse this "
-    "log; ingest, annotate and export work"
+    "no LiDAR sweeps: there is nothing to fuse, so `mudg fuse`, `mudg run`, and what starts from a fused cloud refuse this log; ingest, "
+    "annotate, export, and fit with emernerf work"
 )
 
 
@@ -176,7 +176,7 @@ def _check_ego(scene: Scene) -> Findings:
         if speed.max() > MAX_SPEED_M_S:
             yield _warning("ego path", f"the vehicle moves at {speed.max():.0f} m/s; check units of time and place")
     for gap in motion.gaps(ego.times_s, ego.world_from_ego):
-        yield _warning("ego path", f"{gap}; ingest refuses frames there (--skip-missing, --bridge-gaps)")
+        yield _warning("ego path", f"{gap}{'; frames in it would have guessed poses' if gap.is_guess else ''}")
     yield from _check_keys("ego path", ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S, _JUMP_M)
     if scene.frames:
         first = scene.frames[0].view.center_world

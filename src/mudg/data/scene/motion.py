@@ -63,6 +63,11 @@ class Gap:
     moved_m: float
     off_m: float
 
+    @property
+    def is_guess(self) -> bool:
+        """Whether poses in it would be guesses."""
+        return self.off_m > OFF_M or self.end_s - self.start_s > LONG_GAP_S
+
     def __str__(self) -> str:
         return (
             f"no pose for {self.end_s - self.start_s:.2f} s after {self.start_s:.3f} s (key {self.key}), while it moved "

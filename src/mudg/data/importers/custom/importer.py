@@ -124,7 +124,8 @@ def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
     if len(placed) < len(found):
         times = [r.time_s for r in found if r not in placed]
         log.warn(
-            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from {min(times):.3f} to {max(times):.3f} s"
+            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from {min(times):.3f} to "
+            f"{max(times):.3f} s"
         )
     return placed
 
@@ -271,7 +272,13 @@ def check_log(source: Path) -> list[Finding]:
         yield from scene_check.check_image(frame, pixels)
 
     def check_sweep(sweep: Sweep, cloud: LogItem) -> Iterator[Finding]:
-        yield from scene_check.check_points(scene, sweep, read_sweep(content, cloud, ImportOptions()))
+        points = read_sweep(content, cloud, ImportOptions())
+        if points.no_returns:
+            rows = points.no_returns + len(points.xyz)
+            yield Finding(
+                "note", f"sweep {sweep.id}", f"{points.no_returns} of {rows} points mark beams without a return; ingest leaves them out"
+            )
+        yield from scene_check.check_points(scene, sweep, points)
 
     with log.task("checking images and sweeps", len(images) + len(sweeps)) as bar:
         checks = [
@@ -301,9 +308,7 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
             else:
                 sweeps[record] = Sweep(name, record.sensor, record.time_s, pose, record.file)
         except InputError as problem:
-            remedy = "are the clocks the same? --skip-missing leaves such records out"
-            where = f"{record.kind} {record.file.path}"
-            complain(InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=remedy))
+            complain(problem.located(f"{record.kind} {record.file.path}"))
     groups: dict[int, list[str]] = {}
     for record, moment in _moments(list(frames)).items():
         groups.setdefault(moment, []).append(frames[record].id)

@@ -226,7 +226,8 @@ def _choose_frames(files: KittiFiles, stamps: Mapping[str, Mapping[int, float]],
     if files.single:
         return [_single_frame(files, options)]
     streams = {**files.images, **({SENSOR: files.scans} if files.scans else {})}
-    stamped = {f"timestamps of {name}": set(streams[name]) & set(times) for name, times in stamps.items()}
+    recorded = set().union(*streams.values())
+    stamped = {f"timestamps of {name}": recorded - (set(streams[name]) - set(times)) for name, times in stamps.items()}
     frames = layout.complete_frames({**streams, **stamped}, options, str(files.folder), "kitti")
     if not files.scans:
         log.warn("kitti: no scans found: the scene has images only, and there is nothing to fuse")

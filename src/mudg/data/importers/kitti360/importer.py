@@ -44,7 +44,15 @@ from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
-from mudg.data.importers.common import deskew, mended_path, origin_note, pose_near, rigid_pose, seconds, world_from_first
+from mudg.data.importers.common import (
+    deskew,
+    mended_path,
+    origin_note,
+    pose_near,
+    rigid_pose,
+    seconds,
+    world_from_first,
+)
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, image_notes, image_size
 from mudg.data.importers.kitti import poses as kitti_poses
@@ -53,6 +61,7 @@ from mudg.data.importers.kitti360.boxes import LABEL_OF, Kitti360Box, read_boxes
 from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.motion import GAP_M
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
@@ -60,8 +69,6 @@ CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "
 USUAL: Final = ("image_00", "image_01")
 SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
-MAX_GAP_M: Final = 3.0
-"""Frames without a pose are interpolated where the vehicle moved less than this between the poses around them."""
 _SICK_REACH_S: Final = 0.055
 _TRAIN_IDS: Final = {
     7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15,
@@ -263,7 +270,7 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
 
 
 def _has_pose(ego: EgoPath, time_s: float) -> bool:
-    """Whether there is a pose at a time, or it can be interpolated. NaN: no."""
+    """Whether there is a pose at a time, or the vehicle moved less than ``GAP_M`` between the poses around it. NaN: no."""
     if not np.isfinite(time_s):
         return False
     after = int(np.searchsorted(ego.times_s, time_s))
@@ -272,7 +279,7 @@ def _has_pose(ego: EgoPath, time_s: float) -> bool:
     if after in (0, len(ego.times_s)):
         return False
     moved = ego.world_from_ego[after, :3, 3] - ego.world_from_ego[after - 1, :3, 3]
-    return bool(np.linalg.norm(moved) < MAX_GAP_M)
+    return bool(np.linalg.norm(moved) < GAP_M)
 
 
 def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:

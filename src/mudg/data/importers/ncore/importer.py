@@ -90,7 +90,7 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: there are several recordings and none was chosen, or no such camera.
         InputError: missing, damaged or contradictory; nothing is left at ``out``. ResourceError: the package is not installed.
     """
-    refuse_options(options, "NCore", "poses", "boxes")
+    refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()
     stores = _choose(source, options)
     for path in stores:

@@ -33,7 +33,15 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_cloud
-from mudg.data.importers.common import nearest_index, seconds, world_from_first
+from mudg.data.importers.common import (
+    has_pose,
+    mended_path,
+    nearest_index,
+    origin_note,
+    pose_near,
+    seconds,
+    world_from_first,
+)
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, brown_conrady, fit_images, image_notes
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
@@ -277,7 +285,8 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
 
 def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
     start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
-    ego = _ego_path(plan, start_us, str(opened.path))
+    found: list[str] = []
+    ego = mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
     first = ego.pose_at(0.0)
     if first is None:
         raise InputError("vehicle poses do not cover the log", where=f"{opened.path}: ego_pose",
@@ -287,8 +296,11 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
     tracks, track_notes = _read_tracks(opened, plan, start_us, world_from_source)
-    notes = [*plan.notes, *image_notes(fits)]
+    notes = [*plan.notes, *found, *image_notes(fits), origin_note(first)]
     notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
+
+    def taken_s(shot: _Shot) -> float:
+        return (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
 
     def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
         index, what = item
@@ -299,14 +311,16 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
             )
             return
         for shot in what:
-            time_s = (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
-            world_from_ego = ego.pose_at(time_s)
-            if world_from_ego is None:
-                raise InputError("vehicle poses do not cover an image", where=str(shot.file), got=f"{time_s:.3f} s")
-            world_from_cam = world_from_ego @ plan.cameras[shot.channel].ego_from_cam
+            time_s = taken_s(shot)
+            world_from_cam = pose_near(ego, time_s, where=str(shot.file)) @ plan.cameras[shot.channel].ego_from_cam
             yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
 
-    items = [*enumerate(plan.clouds), *enumerate(plan.moments)]
+    moments = list(enumerate(plan.moments))
+    if options.skip_missing:
+        moments = [one for one in moments if all(has_pose(ego, taken_s(shot)) for shot in one[1])]
+        if len(moments) < len(plan.moments):
+            notes.append(f"{len(plan.moments) - len(moments)} moments without a vehicle pose were left out")
+    items = [*enumerate(plan.clouds), *moments]
     source = Source("nuplan", LICENCE, None, (*notes, *track_notes))
     return SceneContent(plan.name, source, fits, items, convert, _item_name, ego, tracks=lambda: (tracks, ()))
 

@@ -42,7 +42,14 @@ from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.columns import finite_columns, record_fields, require_columns, returns_of
-from mudg.data.importers.common import pose_from_quaternion, pose_near, seconds, world_from_first
+from mudg.data.importers.common import (
+    mended_path,
+    origin_note,
+    pose_from_quaternion,
+    pose_near,
+    seconds,
+    world_from_first,
+)
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.data.importers.layout import LogFiles
@@ -136,11 +143,12 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
     clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
     frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
-    motion = _Motion.read(folder, frames, chosen)
+    notes: list[str] = []
+    motion = _Motion.read(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
     classes = PointClasses(folder / "annotations" / "semseg", frames, options)
-    notes = [
+    notes += [
         f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here",
         *image_notes(fits),
         *classes.notes,
@@ -237,15 +245,20 @@ class _Motion:
     places: Mapping[int, Matrix]
 
     @classmethod
-    def read(cls, folder: Path, frames: Sequence[int], cameras: Sequence[str]) -> _Motion:
+    def read(
+        cls, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
+    ) -> _Motion:
         file = folder / "lidar" / "timestamps.json"
-        known = [*range(max(frames[0] - 1, 0), frames[0]), *frames]
+        known = range(max(frames[0] - 1, 0), frames[-1] + 1)  # those of frames that are left out tell where the vehicle was, too
+        first = frames[0] - known[0]
         raw_s = _times(file, known)
-        start_s = float(raw_s[len(known) - len(frames)])
+        start_s = float(raw_s[first])
         forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
-        world_from_source = world_from_first(forward[len(known) - len(frames)])
+        world_from_source = world_from_first(forward[first])
+        notes.append(origin_note(forward[first]))
         path = EgoPath(seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
-        raw_s = raw_s[-len(frames) :]
+        path = mended_path(path, options, notes)
+        raw_s = raw_s[[number - known[0] for number in frames]]
         needed = dict.fromkeys((*cameras, "front_camera"))
         camera_s, world_from_cam = {}, {}
         for name in needed:
