@@ -52,6 +52,7 @@ _SPEED_OVER_S: Final = 0.05
 _LEAST_UPRIGHT: Final = 0.5
 _DRIVES_M_S: Final = 1.0
 _LEAST_ALONG: Final = 0.8
+_COURSE_WITHIN_S: Final = 1.0
 _EPOCH_S: Final = (1e8, 4.1e9)
 """Seconds since 1970 that a recording may carry: 1973 to 2099."""
 _MAX_LOG_S: Final = 4 * 3600.0
@@ -365,7 +366,7 @@ def check_motion(ego: EgoPath, where: str) -> None:
             got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
             expected=f"under {MAX_SPEED_M_S:.0f} m/s",
             remedy="check the units of times and translations, and that all poses are of one log")  # fmt: skip
-    drives = speed > _DRIVES_M_S
+    drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)  # over a gap it may turn
     if drives.any():
         forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
         along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too

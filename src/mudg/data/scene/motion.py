@@ -80,7 +80,8 @@ def gaps(times_s: Times, poses: Matrix) -> list[Gap]:
     steps = np.diff(times_s)
     if not (steps > GAP_S).any():
         return []
-    long = np.flatnonzero(steps > max(GAP_S, GAP_STEPS * float(np.median(steps))))
+    usual = float(np.sort(steps)[len(steps) // 10])  # not the median: of few keys a gap would be usual
+    long = np.flatnonzero(steps > max(GAP_S, GAP_STEPS * usual))
     moved = np.linalg.norm(poses[long + 1, :3, 3] - poses[long, :3, 3], axis=1)
     return [
         Gap(key, float(times_s[key]), float(times_s[key + 1]), float(m), max(_off_m(times_s, poses, key, u) for u in (0.25, 0.5, 0.75)))

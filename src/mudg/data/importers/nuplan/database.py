@@ -155,8 +155,8 @@ class NuplanLog:
             )
         )
 
-    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud:
-        """One point cloud with its pose; its file lies below ``blobs``."""
+    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud | None:
+        """One point cloud with its pose; its file lies below ``blobs``. None if the vehicle has no pose then."""
         for lidar, file, time_us, *pose in self.rows(
             "SELECT p.lidar_token, p.filename, p.timestamp, e.x, e.y, e.z, e.qw, e.qx, e.qy, e.qz "
             "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token = ?",
@@ -170,8 +170,7 @@ class NuplanLog:
             places = tuple((invert(mount) @ other)[:3, 3] for other in ego_from_lidar.values())
             path, time_us = path_inside(blobs, file, where), self._time(time_us, "lidar_pc")
             return NuplanCloud(token, path, time_us, self._ego(pose, where) @ mount, places)
-        raise InputError("point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
-            expected="a token of ego_pose")  # fmt: skip
+        return None
 
     def ego_poses(self, first_us: int, last_us: int) -> tuple[NDArray[np.int64], Matrix]:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""

@@ -192,7 +192,15 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
     notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
     lidars = opened.lidars()
-    clouds = [opened.cloud(token, lidars, blobs) for token, _ in chosen]
+    placed = {token: opened.cloud(token, lidars, blobs) for token, _ in chosen}
+    clouds = [cloud for cloud in placed.values() if cloud is not None]
+    if len(clouds) < len(placed):
+        without = [token.hex() for token, cloud in placed.items() if cloud is None]
+        if not options.skip_missing:
+            raise InputError("point cloud has no vehicle pose", where=f"{where}: lidar_pc {without[0]}.ego_pose_token",
+                expected="a token of ego_pose", got=f"{len(without)} of {len(placed)} clouds have none",
+                remedy="choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        notes.append(f"{len(without)} clouds without a vehicle pose were left out")
     lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
     if lacking:
         _refuse_missing("point cloud", lacking, len(clouds), options)
