@@ -180,7 +180,7 @@ def test_optional_parts_and_unknown_categories(drive: Path, tmp_path: Path, caps
     shutil.rmtree(copy / "sensors" / "lidar")
     bare = ingest(copy, tmp_path / "bare")
     assert (len(bare.sweeps), bare.tracks) == (0, ())
-    assert len(bare.source.notes) == 2
+    assert len(bare.source.notes) == 3
 
 
 def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

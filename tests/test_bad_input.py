@@ -21,8 +21,8 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import check_scene, decode_image, read_image, read_points, read_scene, write_zip
-from mudg.stages import annotate, fuse, ingest
-from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig
+from mudg.stages import annotate, fuse, ingest, run
+from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig, RunConfig
 
 IMAGE = "image_02/data/0000000003.png"
 SCAN = "velodyne_points/data/0000000003.bin"
@@ -175,7 +175,7 @@ def test_broken_kitti_log(case: str, drive: Path, tmp_path: Path) -> None:
 RAW: dict[str, tuple[str, Callable[[Path], object]]] = {
     "missing packet": ("packets are missing", lambda r: (r / "oxts/data/0000000002.txt").unlink()),
     "packet cut off": ("wrong number of values", lambda r: cut(r / "oxts/data/0000000002.txt", 0.5)),
-    "packet empty": ("wrong number of values", lambda r: (r / "oxts/data/0000000002.txt").write_text("")),
+    "packet empty": ("packets are missing", lambda r: (r / "oxts/data/0000000002.txt").write_text("")),
     "latitude": ("out of range", lambda r: rewrite(r / "oxts/data/0000000002.txt", lambda t: "149" + t[2:])),
     "timestamps cut off": ("do not cover", lambda r: cut(r / "image_02/timestamps.txt", 0.5)),
     "timestamps unsorted": (
@@ -261,9 +261,16 @@ def test_one_frame(tmp_path: Path) -> None:
 
 def test_no_lidar(drive: Path, tmp_path: Path) -> None:
     shutil.rmtree(drive / "velodyne_points")
-    scene, cloud = through(drive, tmp_path)
+    scene = IMPORTERS["kitti"](drive, tmp_path / "scene", ImportOptions())
     assert scene.sweeps == ()
-    assert len(cloud.static) == 0
+    assert annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "annotated").is_dir()
+    with pytest.raises(InputError, match="no LiDAR sweeps"):
+        fuse.run(FuseConfig(), tmp_path / "annotated", tmp_path / "fused")
+    assert not (tmp_path / "fused").exists()
+    with pytest.raises(InputError, match="no LiDAR sweeps"):
+        run.run_chain(RunConfig(), drive, tmp_path / "run")
+    assert not (tmp_path / "run" / "annotate").exists()  # before minutes of work, not after
+    assert any("no LiDAR" in f.message and f.level == "warning" for f in check_scene(scene.root))
 
 
 def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:

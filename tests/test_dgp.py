@@ -107,7 +107,7 @@ def test_swapped_sides_and_broken_files_are_refused(
         with pytest.raises(InputError, match="cut off") as caught:
             ingest(copy, tmp_path / "out")
         assert "2.npz" in caught.value.where
-    np.savez(path, data=np.full((3, 4), np.nan))
+    np.savez(path, data=np.array([[1.0, np.nan, 2.0, 0.5]]))
     with pytest.raises(InputError, match="not finite"):
         ingest(copy, tmp_path / "out")
     np.savez(path, data=np.array([{"pickled": 1}], object))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,18 @@ def rigid(value: Any, where: str) -> Matrix:
             remedy="remove scale or mirroring from the matrix; check row against column order")  # fmt: skip
     matrix.setflags(write=False)
     return matrix
+
+
+MAX_NAME_BYTES: Final = 200
+
+
+def foreign_name(value: str, where: str) -> str:
+    """An id, name or class from a file of others, at most 200 bytes long."""
+    size = len(value) if len(value) > MAX_NAME_BYTES else len(value.encode("utf-8", "surrogatepass"))
+    if size > MAX_NAME_BYTES:
+        raise InputError("name is too long", where=where, expected=f"at most {MAX_NAME_BYTES} bytes",
+            got=f"{size} bytes, beginning {value[:40]!r}", remedy="is the file damaged, or of another format?")  # fmt: skip
+    return value
 
 
 def finite(value: float, where: str) -> float:

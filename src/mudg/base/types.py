@@ -217,12 +217,14 @@ class SweepPoints:
         intensity: f32[N] in [0, 1].
         dt_s: f32[N] seconds relative to the sweep's time.
         classes: u8[N] train ids that people gave the points (255 = unlabelled), or None where the log has none.
+        no_returns: rows of the source that mark a beam without a return; they are not among the points.
     """
 
     xyz: NDArray[np.float32]
     intensity: NDArray[np.float32]
     dt_s: NDArray[np.float32]
     classes: NDArray[np.uint8] | None = None
+    no_returns: int = 0
 
     def __post_init__(self) -> None:
         checks.check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
@@ -251,7 +253,9 @@ class Track:
     world_from_object: Matrix
 
     def __post_init__(self) -> None:
-        owner = f"track {self.id!r}"
+        owner = f"track {self.id[:40]!r}"
+        for name in ("id", "label"):
+            checks.foreign_name(getattr(self, name), f"{owner}: {name}")
         size = np.array(self.size_m, np.float64).reshape(-1)
         if size.shape != (3,) or not np.isfinite(size).all() or (size <= 0).any():
             what = "a box needs a positive length, width and height"

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from mudg.base import geometry
 from mudg.base.types import Scene
-from mudg.data.scene.check import VEHICLES
+from mudg.data.scene.motion import VEHICLES
 
 GROUND_COLOR: Final = (18, 18, 18)
 TEXT_COLOR: Final = (235, 235, 235)

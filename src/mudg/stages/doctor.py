@@ -117,6 +117,8 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     from mudg.stages.config import PRESETS, cost
 
     scene = read_scene(path)
+    if not scene.sweeps:
+        return {}, ["no preset of `mudg run` applies: the log has no LiDAR"]
     cores = native.default_threads()
     size, machine = scene_size(scene), cost.Machine(cores, probe.speed(cores).now, os.cpu_count() or 1)
     devices = {"cpu": memory.free_bytes()}

@@ -17,6 +17,7 @@ from PIL import Image
 from mudg.base import log, store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.config import to_dict
+from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
 from mudg.core.color_match import match_cameras
@@ -32,6 +33,7 @@ from mudg.core.fusion import (
 )
 from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
+from mudg.data.scene.check import check_distance
 from mudg.report.top_view import TopView, draw_top_view
 from mudg.stages.batches import lists
 from mudg.stages.batches.listed import ListedRun, run_listed
@@ -54,13 +56,16 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
         out: output folder; a finished result of the same configuration and scene is verified and reused.
 
     Raises:
-        InputError: the scene is malformed. UsageError: ``out`` holds something else.
+        InputError: the scene is malformed, or has no LiDAR. UsageError: ``out`` holds something else.
     """
     refuse_overlap(out, {"scene": scene})
+    loaded = read_scene(scene)
+    refuse_without_lidar(loaded)
     folder = RunDir.open(out, _OUTPUT, to_dict(config), {"scene": store.digest(scene)}, overwrite)
     if folder.complete:
         return folder.reused()
-    loaded = read_scene(scene)
+    for finding in check_distance(loaded):
+        log.warn(f"fuse: {finding.message}")
     rules = rules_of(config)
     cameras = camera_colors(loaded, config, rules) if config.match_colors else SAME_COLORS
     cloud, report = fuse_sweeps(scene_sweeps(loaded, config), loaded.tracks, rules, cameras)
@@ -74,6 +79,14 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
+
+
+def refuse_without_lidar(scene: Scene) -> None:
+    """InputError for a scene without LiDAR sweeps: there is nothing to fuse, and no method starts without a fused cloud."""
+    if not scene.sweeps:
+        raise InputError("the log has no LiDAR sweeps, which a fused cloud, and what starts from it, need", where=scene.root,
+            expected="sweeps of at least one LiDAR", got=f"{len(scene.frames)} images only",
+            remedy="give a log with LiDAR; ingest, annotate, export, and fit with emernerf work without")  # fmt: skip
 
 
 def run_many(

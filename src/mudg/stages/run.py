@@ -174,7 +174,7 @@ def _is_own_scene(source: str | Path, out: Path) -> bool:
 
 
 def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Ledger, overwrite: bool) -> Path:
-    """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate."""
+    """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate. InputError without LiDAR."""
     from mudg.stages import annotate, ingest
 
     if str(source) != CITY and _is_scene(source):
@@ -210,9 +210,13 @@ def _forecast(config: RunConfig, scene: Path) -> str:
 
 
 def _has_semantics(scene: Path) -> bool:
+    """Whether every frame has semantic labels. InputError without LiDAR: the chain could not go on after annotate."""
     from mudg.data.scene import read_scene
+    from mudg.stages import fuse
 
-    return all("semantics" in frame.labels for frame in read_scene(scene).frames)
+    loaded = read_scene(scene)
+    fuse.refuse_without_lidar(loaded)
+    return all("semantics" in frame.labels for frame in loaded.frames)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import common, drive_log
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.columns import Columns, arrow_files, finite_columns, require_columns
+from mudg.data.importers.columns import Columns, arrow_files, finite_columns, require_columns, returns_of
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.data.importers.layout import (
     LogFiles,
@@ -57,6 +57,7 @@ CAMERAS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
+_LOWER: Final = "down_lidar"
 NANOSECONDS: Final = 10**9
 _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
@@ -146,7 +147,11 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
         folder / "city_SE3_egovehicle.feather",
         folder / "calibration" / "egovehicle_SE3_sensor.feather",
     )
-    mounts, ego = read_mounts(mount_file), read_ego(ego_file, zero_ns)
+    notes: list[str] = []
+    mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
+    if options.skip_missing:
+        files = {name: _with_poses(found, ego, zero_ns, name) for name, found in files.items()}
+        scans = _with_poses(scans, ego, zero_ns, SENSOR)
 
     def map_from_ego(stamp: int) -> Matrix:
         return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, str(ego_file))
@@ -158,14 +163,15 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
         for stamp, path in found.items()
     ]
     upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
+    places = [pose[:3, 3] for name, pose in mounts.items() if name in (_UPPER, _LOWER)]
     sweeps = [
         SweepRecord(
-            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper)
+            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper, places)
         )
         for t, path in scans.items()
     ]
-    notes = [] if sweeps else ["no LiDAR sweeps in the log"]
-    tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns)
+    notes += [] if sweeps else ["no LiDAR sweeps in the log"]
+    tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns, skip_missing=options.skip_missing)
     cameras = read_cameras(folder / "calibration" / "intrinsics.feather", chosen)
     source = Source("argoverse2", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
@@ -179,6 +185,14 @@ def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     )
     common.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
     return dict(found)
+
+
+def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: str) -> dict[int, Path]:
+    """The files at whose times the vehicle's path is known."""
+    placed = {t: path for t, path in files.items() if common.has_pose(ego, (t - zero_ns) / NANOSECONDS, _POSE_SLACK_S)}
+    if len(placed) < len(files):
+        log.warn(f"argoverse2: left out {len(files) - len(placed)} files of {sensor} without a vehicle pose")
+    return placed
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------
@@ -256,8 +270,8 @@ def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
     return cameras
 
 
-def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], list[str]]:
-    """Tracks in the city's frame, and notes; no file is no tracks."""
+def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = False) -> tuple[list[Track], list[str]]:
+    """Tracks in the city's frame, and notes; no file is no tracks. ``skip_missing`` leaves out boxes without a vehicle pose."""
     where = str(path)
     if not path.is_file():
         return [], ["no annotations in this log: everything counts as static"]
@@ -266,10 +280,14 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     stamps, poses = _stamps(columns, where), _poses(columns, where)
     sizes = finite_columns(columns, ("length_m", "width_m", "height_m"), where)
     map_from_ego = {
-        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where) for t in set(stamps)
+        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where)
+        for t in set(stamps)
+        if not skip_missing or common.has_pose(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S)
     }
     tracks = BoxTracks(where, LABELS)
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        if int(stamp) not in map_from_ego:
+            continue
         label = tracks.label_of(str(columns["category"][row]))
         length, width, height = sizes[row].tolist()
         time_s = (int(stamp) - zero_ns) / NANOSECONDS
@@ -279,14 +297,18 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int) -> tuple[list[Track], li
     return tracks.tracks()
 
 
-def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:
+def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()) -> SweepPoints:
     """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
+
+    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it, f64[3] each.
 
     Raises:
         InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
     """
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
+    returns = returns_of(columns, where, places)
+    columns = {name: values[returns] for name, values in columns.items()}
     xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
     intensity = finite_columns(columns, ("intensity",), where)[:, 0]
     offset_ns = columns["offset_ns"]
@@ -301,4 +323,4 @@ def read_sweep(path: Path, ego_from_lidar: Matrix) -> SweepPoints:
             got=f"{intensity.min():g} to {intensity.max():g}")  # fmt: skip
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
-    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s)
+    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s, no_returns=int((~returns).sum()))

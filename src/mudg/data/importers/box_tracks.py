@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base.checks import foreign_name
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, quaternion_from_matrix, slerp
 from mudg.base.types import Track
+from mudg.data.scene import motion
 
 Matrix = NDArray[np.float64]
 MAX_GAP_S: Final = 0.55
@@ -23,6 +25,7 @@ LONGER_THAN_WIDE: Final = frozenset(("car", "van", "bus", "vehicle"))
 _ROW: Final = 17  # time, delay, size, pose
 _MIN_STEP_S: Final = 0.05
 _SAME_TIME_S: Final = 1e-4
+_NAMED: Final = 5
 Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
 """Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities f64[n, 3] m/s."""
 
@@ -66,9 +69,10 @@ class BoxTracks:
         return len(self._members)
 
     def label_of(self, category: str) -> str:
-        """The label of a class of the data set; classes that are not known are counted."""
+        """The label of a class of the data set; classes that are not known are counted. InputError for a name above 200 bytes."""
         if category in self._labels:
             return self._labels[category]
+        foreign_name(category, f"{self._where}: class of a box")
         self._unknown[category] = self._unknown.get(category, 0) + 1
         return category.rsplit(".", 1)[-1].strip().lower().replace(" ", "_") or "unknown"
 
@@ -97,8 +101,9 @@ class BoxTracks:
             where: file and record, for messages.
 
         Raises:
-            InputError: the size is not positive or absurd.
+            InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
         """
+        foreign_name(track, f"{where or self._where}: id of an object")
         size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
         member = self._members.setdefault(track, _Member())
         member.labels[label] = member.labels.get(label, 0) + 1
@@ -136,6 +141,7 @@ class BoxTracks:
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
             if member.standing:
+                poses, _ = motion.unflipped(times, poses, motion.MOST_TURN_RAD_S)
                 ends = _ends(times, images_s)
                 tracks.append(Track(name, label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
                 continue
@@ -160,6 +166,18 @@ class BoxTracks:
         if self._unknown:
             notes.append(unknown_classes(self._unknown))
         return notes
+
+
+def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
+    """The tracks with headings that flip by 180 degrees turned back, and a note about those that were; see ``motion.unflipped``."""
+    mended, names = [], []
+    for track in tracks:
+        poses, turned = motion.unflipped(track.times_s, track.world_from_object, motion.most_turn_rad_s(track.label))
+        mended.append(replace(track, world_from_object=poses) if len(turned) else track)
+        if len(turned):
+            names.append(f"{track.id} at {track.times_s[turned[0]]:.2f} s ({len(turned)} of {len(poses)} keys)")
+    some = ", ".join(names[:_NAMED]) + (f", ... ({len(names)} in all)" if len(names) > _NAMED else "")
+    return mended, [f"headings that flip by 180 degrees were turned back: {some}"] if names else []
 
 
 def unknown_classes(counts: Mapping[str, int]) -> str:

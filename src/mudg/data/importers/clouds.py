@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.data.scene.returns import is_return
 
 MAX_POINTS: Final = 50_000_000
 _MAX_HEADER_BYTES: Final = 1 << 16
@@ -34,7 +35,7 @@ Fields = Mapping[str, NDArray]
 class Cloud:
     """Points as a file has them: ``xyz`` f64[N, 3], and every other named field of one number a point, ``fields`` [N] each.
 
-    Rows whose coordinates are all NaN (how PCD writes a missing return) are left out; ``missing`` counts them.
+    Beams without a return (``scene.returns.is_return``) are left out; ``missing`` counts them.
     """
 
     xyz: NDArray[np.float64]
@@ -58,9 +59,8 @@ def read_cloud(path: Path) -> Cloud:
         raise InputError("cloud has no coordinates", where=str(path), expected="fields x, y, z",
             got=", ".join(columns) or "no fields")  # fmt: skip
     xyz = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
-    nowhere = np.isnan(xyz).all(1)
-    if nowhere.any():
-        xyz = xyz[~nowhere]
+    nowhere = ~is_return(xyz)
+    xyz = xyz[~nowhere]
     if not np.isfinite(xyz).all():
         bad = int((~np.isfinite(xyz).all(1)).sum())
         raise InputError("cloud holds coordinates that are not finite", where=str(path),
@@ -130,10 +130,10 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
             header[words[0].upper()] = words[1:]
     header.setdefault("COUNT", ["1"] * len(header.get("FIELDS", [])))
     header.setdefault("HEIGHT", ["1"])
-    absent = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "POINTS", "DATA") if not header.get(key)]
+    absent = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA") if not header.get(key)]
     if absent:
         raise InputError("PCD header is incomplete", where=where, expected=", ".join(absent),
-            got=", ".join(header)[:200])  # fmt: skip
+            got=", ".join(f"{key} {' '.join(values)}" for key, values in header.items())[:200])  # fmt: skip
     return header, start
 
 
@@ -283,25 +283,27 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
 # --- BIN and NPZ ------------------------------------------------------------------------------------------------------
 
 
-def read_float_rows(path: Path, columns: int, what: str = "scan") -> NDArray[np.float32]:
-    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns].
+def read_float_rows(path: Path, columns: int, what: str = "scan", axes: int = 3) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are returns bool[N].
 
     Args:
         what: what one file holds, for messages.
+        axes: the first so many columns are coordinates in the sensor's frame.
 
     Raises:
-        InputError: missing, cut off, or values that are not finite.
+        InputError: missing, cut off, or values of a return that are not finite.
     """
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
         raise InputError(f"{what} is cut off", where=str(path), got=f"{len(content)} bytes",
             expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)", remedy="copy the file again")  # fmt: skip
     rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
-    bad = ~np.isfinite(rows).all(1)
+    returns = is_return(rows[:, :axes])
+    bad = ~np.isfinite(rows[returns]).all(1)
     if bad.any():
         raise InputError(f"{what} holds values that are not finite", where=str(path),
             got=f"{int(bad.sum())} of {len(rows)} rows", remedy="copy the file again")  # fmt: skip
-    return rows
+    return rows, returns
 
 
 def read_bin(content: bytes, where: str) -> dict[str, NDArray]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base.errors import InputError, ResourceError
+from mudg.data.scene.returns import is_return, near_places
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -39,6 +40,15 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
         raise InputError("column holds values that are not finite", where=where,
             got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}")  # fmt: skip
     return table
+
+
+def returns_of(columns: Columns, where: object, places: Iterable[NDArray[np.float64]] = ()) -> NDArray[np.bool_]:
+    """Rows of a cloud's columns x, y, z that are returns of a beam: by their numbers, and not at one of the sensors' ``places``."""
+    try:
+        xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
+    except (TypeError, ValueError) as error:
+        raise InputError("column does not hold numbers", where=f"{where}: x, y, z", got=str(error)[:120]) from error
+    return is_return(xyz) & ~near_places(xyz, places)
 
 
 @contextmanager

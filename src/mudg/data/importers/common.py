@@ -33,6 +33,8 @@ from mudg.base.geometry import (
     yaw_of,
 )
 from mudg.base.types import EgoPath
+from mudg.data.importers.options import ImportOptions
+from mudg.data.scene import motion
 
 Item = TypeVar("Item")
 Matrix = NDArray[np.float64]
@@ -50,6 +52,7 @@ _SPEED_OVER_S: Final = 0.05
 _LEAST_UPRIGHT: Final = 0.5
 _DRIVES_M_S: Final = 1.0
 _LEAST_ALONG: Final = 0.8
+_COURSE_WITHIN_S: Final = 1.0
 _EPOCH_S: Final = (1e8, 4.1e9)
 """Seconds since 1970 that a recording may carry: 1973 to 2099."""
 _MAX_LOG_S: Final = 4 * 3600.0
@@ -258,16 +261,20 @@ def pose_near(
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
 
     Raises:
-        InputError: more than ``max_beyond_s`` outside.
+        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess (``motion.gap_at``).
     """
     inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
     if inside is not None:
+        gap = motion.gap_at(ego, time_s)
+        if gap is not None:
+            raise gap_problem(gap, time_s, where)
         return inside
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
     if beyond > max_beyond_s:
         raise InputError("vehicle poses do not cover the images and scans", where=where, got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame", remedy="is the pose file cut off, or of another log?")  # fmt: skip
+            expected="poses from the first to the last frame",
+            remedy="are the clocks the same? is the file cut off, or of another log? --skip-missing leaves such records out")  # fmt: skip
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]
     near, far = (0, 1) if first else (-1, -2)
@@ -278,6 +285,51 @@ def pose_near(
     back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
     end = ego.world_from_ego[near]
     return end if back is None else end @ invert(back) @ end
+
+
+def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
+    """The error about an image or scan in a gap of the vehicle's path."""
+    return InputError("vehicle poses have a gap here", where=where, got=f"at {time_s:.3f} s: {gap}",
+        expected="poses around every image and scan",
+        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps")  # fmt: skip
+
+
+def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> bool:
+    """Whether ``pose_near`` has a pose at a time."""
+    try:
+        pose_near(ego, time_s, max_beyond_s)
+    except InputError:
+        return False
+    return True
+
+
+def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPath:
+    """The vehicle's path with headings that flip by 180 degrees turned back and, if that is asked for, its gaps bridged.
+
+    Args:
+        options: ``bridge_gaps`` is used.
+        notes: what was done is added.
+    """
+    poses, turned = motion.unflipped(ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S)
+    if len(turned):
+        ego = EgoPath(ego.times_s, poses)
+        notes.append(
+            f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {len(turned)} of {len(poses)} poses were "
+            "turned back"
+        )
+    found = motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []
+    if found:
+        longest = max(found, key=lambda gap: gap.moved_m)
+        notes.append(f"{len(found)} gaps of the vehicle's path are bridged by curves, the longest: {longest}")
+        ego = motion.bridged(ego)
+    return ego
+
+
+def origin_note(map_from_ego: Matrix) -> str:
+    """A note that says where the scene's world lies in the data set's: its origin is the first vehicle pose, subtracted in float64."""
+    x, y, z = (float(value) for value in map_from_ego[:3, 3])
+    turn = yaw_of(map_from_ego)
+    return f"the world's origin is ({x:.3f}, {y:.3f}, {z:.3f}) m in the data set's world, its x axis turned by {turn:.6f} rad"
 
 
 def world_from_first(map_from_ego: Matrix) -> Matrix:
@@ -314,7 +366,7 @@ def check_motion(ego: EgoPath, where: str) -> None:
             got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
             expected=f"under {MAX_SPEED_M_S:.0f} m/s",
             remedy="check the units of times and translations, and that all poses are of one log")  # fmt: skip
-    drives = speed > _DRIVES_M_S
+    drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)  # over a gap it may turn
     if drives.any():
         forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
         along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too

@@ -38,6 +38,7 @@ from mudg.data.importers.columns import record_fields
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, path_inside, refuse_untwist, the_only
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.returns import is_return
 
 Matrix = NDArray[np.float64]
 
@@ -298,10 +299,11 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     if not fits or not {"X", "Y", "Z"} <= {*columns}:
         raise InputError("cloud does not have its columns", where=f"{where}: data", got=f"{data.dtype} {data.shape}",
             expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}")  # fmt: skip
-    data = data.astype(np.float32)
+    returns = is_return(data[:, [columns.index(axis) for axis in "XYZ"]])
+    no_returns, data = int((~returns).sum()), data[returns].astype(np.float32)
     if not np.isfinite(data).all():
         raise InputError("cloud holds values that are not finite", where=where,
             got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")  # fmt: skip
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
-    return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32))
+    return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32), no_returns=no_returns)

@@ -19,14 +19,16 @@ from typing import Any, Final, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
+from mudg.base import checks, log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.data.importers.box_times import REACH_S, BoxTimes, clip_track, reach_images
-from mudg.data.importers.common import check_motion, for_each, nearest_index, world_from_first
+from mudg.data.importers.box_tracks import turned_back
+from mudg.data.importers.common import check_motion, for_each, gap_problem, nearest_index, origin_note, world_from_first
 from mudg.data.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.data.importers.options import ImportOptions, holdout_split
-from mudg.data.scene import SceneWriter
+from mudg.data.scene import SceneWriter, motion
+from mudg.data.scene.returns import FLOAT32_SPACING_M, at_sensor, float32_spacing_m
 
 Matrix = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -105,6 +107,9 @@ class SceneContent(Generic[Item]):
 def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) -> Scene:
     """Write a scene at ``out``.
 
+    Points at a sensor's own place (``scene.returns``) are left out, and headings of boxes that flip by 180 degrees are turned
+    back; both are counted in the scene's notes.
+
     Images whose size is kept are copied byte for byte, after a check that they are complete and of their camera's size. At most two
     items per worker are in memory, beside the few that wait for the disk.
 
@@ -112,15 +117,21 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
     """
     dataset = content.source.dataset
+    checks.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
+    rows: dict[str, list[tuple[int, int, float]]] = {}
+    """Sensor -> of each sweep, rows without a return, all rows, and how far apart float32 numbers are at its farthest point."""
 
     def convert(item: Item) -> None:
         for part in content.convert(item):
             if isinstance(part, SceneSweep):
-                if len(part.points.xyz) == 0:
-                    log.warn(f"{dataset}: {part.where or f'{part.sensor}/{part.number:06d}'} has no points")
                 sweep_id = f"{part.sensor}/{part.number:06d}"
-                writer.add_sweep(sweep_id, part.sensor, part.time_s, part.world_from_lidar, part.points)
+                points = _without_zeros(part, content.ego)
+                counts = points.no_returns, points.no_returns + len(points.xyz), float32_spacing_m(points.xyz)
+                rows.setdefault(part.sensor, []).append(counts)
+                if len(points.xyz) == 0:
+                    log.warn(f"{dataset}: {part.where or sweep_id} has no points")
+                writer.add_sweep(sweep_id, part.sensor, part.time_s, part.world_from_lidar, points)
                 continue
             fit, frame_id = content.fits[part.camera], f"{part.camera}/{part.number:06d}"
             image = fit.image(part.image, part.where)
@@ -135,7 +146,9 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         for_each(
             content.items, convert, title=title, total=content.total, workers=options.workers, name=content.item_name
         )
-        tracks, notes = content.tracks()
+        found, notes = content.tracks()
+        tracks, turned = turned_back(found)
+        notes = [*notes, *turned, *_row_notes(rows)]
         _log_notes(dataset, notes)
         writer.add_notes(notes)
         for track in tracks:
@@ -146,6 +159,33 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
             groups.setdefault(moment, []).append(frame_id)
         writer.set_split(holdout_split(list(groups.values()), options.test_every))
         return writer.finish()
+
+
+def _without_zeros(sweep: SceneSweep, ego: EgoPath) -> SweepPoints:
+    """The points of a sweep without those at the sensor's own place, which are counted."""
+    points = sweep.points
+    zeros = at_sensor(points, sweep.time_s, sweep.world_from_lidar, ego)
+    if not zeros.any():
+        return points
+    classes = None if points.classes is None else points.classes[~zeros]
+    no_returns = points.no_returns + int(zeros.sum())
+    return SweepPoints(points.xyz[~zeros], points.intensity[~zeros], points.dt_s[~zeros], classes, no_returns)
+
+
+def _row_notes(rows: Mapping[str, Sequence[tuple[int, int, float]]]) -> list[str]:
+    """Notes about beams without a return, and about points so far away that float32 rounds them."""
+    notes = []
+    for sensor, counts in sorted(rows.items()):
+        without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
+        if without:
+            notes.append(f"{sensor}: {without} of {total} points ({without / total:.1%}) mark beams without a return and were left out")
+        spacing_m = max(one[2] for one in counts)
+        if spacing_m > FLOAT32_SPACING_M:
+            log.warn(
+                f"{sensor}: points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm; "
+                "are they in the sensor's frame?"
+            )
+    return notes
 
 
 def _log_notes(dataset: str, notes: Iterable[str]) -> None:
@@ -233,7 +273,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
         InputError: a file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``.
     """
     check_motion(drive.ego, drive.where)
-    chosen = _without_missing(_choose_frames(drive, options), options)
+    chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted((*chosen.images, *chosen.sweeps), key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
     numbers = _numbers_in_time_order(records)
@@ -244,7 +284,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     labels = {name: {} if one.ego is None else {"ego": fits[name].ids(one.ego)} for name, one in optics.items()}
     within = (start_s - REACH_S, end_s + REACH_S)
     seen = BoxTimes([track for track in drive.tracks if clip_track(track, *within) is not None])
-    notes = [*drive.source.notes, *image_notes(fits)]
+    notes = [*drive.source.notes, *image_notes(fits), origin_note(ego.world_from_ego[0])]
     if options.untwist == "no":
         notes.append("sweeps count as moments: point times are left out")
     if options.frames is not None:
@@ -341,6 +381,19 @@ def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
     log.warn(f"left out files that are missing: {lacks}")
     images = {image: number for image, number in chosen.images.items() if image not in absent}
     return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in absent])
+
+
+def _outside_gaps(chosen: _Chosen, drive: DriveLog, options: ImportOptions) -> _Chosen:
+    """Refuse records in gaps of the vehicle's path, or leave them out and say so."""
+    guessed = {record: gap for record in (*chosen.images, *chosen.sweeps) if (gap := motion.gap_at(drive.ego, record.time_s))}
+    if not guessed:
+        return chosen
+    record, gap = next(iter(guessed.items()))
+    if not options.skip_missing or not set(chosen.images) - set(guessed):
+        raise gap_problem(gap, record.time_s, _place(record))
+    log.warn(f"left out {len(guessed)} images and sweeps in gaps of the vehicle's path; the first: {gap}")
+    images = {image: number for image, number in chosen.images.items() if image not in guessed}
+    return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in guessed])
 
 
 def check_sensor_times(drive: DriveLog) -> None:

@@ -22,7 +22,8 @@ class ImportOptions:
         cameras: the dataset's camera names; empty takes the importer's default.
         sequence: which sequence or frame of a folder that holds many.
         poses, boxes: files to use instead of those found by looking.
-        skip_missing: leave out frames of which an image or scan is missing, instead of refusing.
+        skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
+        bridge_gaps: lay curves through gaps between vehicle poses, instead of refusing the frames in them.
         untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
         test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
         resolution: size of the scene's images; None keeps the recorded one. See ``images.ImageFit``.
@@ -35,6 +36,7 @@ class ImportOptions:
     poses: Path | None = None
     boxes: Path | None = None
     skip_missing: bool = False
+    bridge_gaps: bool = False
     untwist: Literal["auto", "yes", "no"] = "auto"
     test_every: int = 4
     resolution: Resolution | None = None

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from mudg.base import geometry, log
 from mudg.base.errors import MudgError
 from mudg.base.types import Frame, Scene, Sweep, SweepPoints, Track
+from mudg.data.scene import motion
 from mudg.data.scene.labels import read_label
+from mudg.data.scene.motion import VEHICLES
 from mudg.data.scene.read import load_scene, read_image, read_points
+from mudg.data.scene.returns import FLOAT32_SPACING_M, LEAST_RANGE_M, at_sensor, float32_spacing_m
 
 Level = Literal["error", "warning", "note"]
 _EXAMPLES: Final = 3
@@ -29,11 +32,16 @@ MAX_GAP_STEPS: Final = 1.8
 MIN_STEP_M: Final = 0.05
 MIN_TURN_DEG: Final = 1.0
 MIN_COURSE_M: Final = 3.0
-VEHICLES: Final = frozenset(
-    ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
-     "bicycle")
-)  # fmt: skip
-"""Labels of what drives. These are longer than wide; barriers, signs and people need not be."""
+_JUMP_M: Final = 0.5
+_TRACK_JUMP_M: Final = 1.5
+_SAME_RANGE_SHARE: Final = 0.02
+_SAME_RANGE_POINTS: Final = 50
+
+
+WITHOUT_LIDAR: Final = (
+    "no LiDAR sweeps: there is nothing to fuse, so `mudg fuse`, `mudg run`, and what starts from a fused cloud refuse this log; ingest, "
+    "annotate, export, and fit with emernerf work"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,17 +175,68 @@ def _check_ego(scene: Scene) -> Findings:
         speed = _speeds(ego.world_from_ego[:, :3, 3], ego.times_s)
         if speed.max() > MAX_SPEED_M_S:
             yield _warning("ego path", f"the vehicle moves at {speed.max():.0f} m/s; check units of time and place")
+    for gap in motion.gaps(ego.times_s, ego.world_from_ego):
+        yield _warning("ego path", f"{gap}{'; frames in it would have guessed poses' if gap.is_guess else ''}")
+    yield from _check_keys("ego path", ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S, _JUMP_M)
     if scene.frames:
         first = scene.frames[0].view.center_world
         distance = float(np.linalg.norm(first - ego.world_from_ego[0, :3, 3]))
         if distance > 20:
             yield _warning(f"frame {scene.frames[0].id}", f"the camera is {distance:.0f} m away from the vehicle")
-        if np.linalg.norm(first) > 10_000:
-            yield _warning(
-                "world",
-                f"the log starts {np.linalg.norm(first):.0f} m from the origin; float32 points lose precision there: "
-                "put the origin near the first pose",
-            )
+    yield from check_distance(scene)
+
+
+def check_distance(scene: Scene) -> Findings:
+    """Whether float32 numbers hold the places of a scene: vehicle, cameras, sensors, and boxes."""
+    places = np.concatenate([
+        scene.ego.world_from_ego[:, :3, 3],
+        *(frame.view.center_world[None] for frame in scene.frames),
+        *(sweep.world_from_lidar[None, :3, 3] for sweep in scene.sweeps),
+        *(track.world_from_object[:, :3, 3] for track in scene.tracks),
+    ])  # fmt: skip
+    spacing_m = float32_spacing_m(places)
+    if spacing_m > FLOAT32_SPACING_M:
+        yield _warning(
+            "world",
+            f"the log reaches {np.linalg.norm(places, axis=1).max():.0f} m from the origin; float32 rounds points there to "
+            f"{spacing_m * 1e3:.3g} mm: put the origin near the first pose, subtracted in float64",
+        )
+
+
+def _check_keys(
+    where: str, times_s: NDArray[np.float64], poses: NDArray[np.float64], most_rad_s: float, jump_m: float
+) -> Findings:
+    """Headings that flip, turns, jumps and accelerations that nothing on wheels makes: of each, how many and the first or largest."""
+    if len(times_s) < 2:
+        return
+    flips = motion.heading_flips(times_s, poses, most_rad_s)
+    if len(flips):
+        mended = "ingest turns it back" if len(motion.unflipped(times_s, poses, most_rad_s)[1]) else "which side is right is not clear"
+        yield _warning(
+            where, f"its heading flips by 180 degrees {len(flips)} times, first after {times_s[flips[0]]:.3f} s (key {flips[0]}): {mended}"
+        )
+    angle, rate = motion.turns(times_s, poses)
+    fast = np.flatnonzero((rate > most_rad_s) & (angle > np.deg2rad(motion.MIN_TURN_DEG)))
+    fast = fast[~np.isin(fast, flips)]
+    if len(fast):
+        key = int(fast[np.argmax(angle[fast])])
+        yield _warning(
+            where,
+            f"it turns by {np.rad2deg(angle[key]):.0f} degrees within {times_s[key + 1] - times_s[key]:.2f} s after "
+            f"{times_s[key]:.3f} s (key {key}; {len(fast)} such turns); check headings and times",
+        )
+    jumps = motion.jumps(times_s, poses, jump_m)
+    if jumps:
+        key, off_m, acceleration = jumps[0]
+        yield _warning(
+            where,
+            f"it jumps by {off_m:.1f} m after {times_s[key]:.3f} s (key {key}, {acceleration:.0f} m/s^2; {len(jumps)} such steps); "
+            "check poses, times and ids",
+        )
+        return
+    key, acceleration = motion.largest_acceleration(times_s, poses)
+    if acceleration > motion.MOST_ACCELERATION_M_S2:
+        yield _warning(where, f"it accelerates by {acceleration:.0f} m/s^2 at {times_s[key]:.3f} s (key {key}); check poses and times")
 
 
 def _check_gaps(scene: Scene) -> Findings:
@@ -223,6 +282,8 @@ def _check_tracks(scene: Scene) -> Findings:
             speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
             if speed.max() > MAX_SPEED_M_S:
                 yield _warning(where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
+            most_rad_s = motion.most_turn_rad_s(track.label)
+            yield from _check_keys(where, track.times_s, track.world_from_object, most_rad_s, _TRACK_JUMP_M)
             yield from _check_course(track, where)
         tilt = np.rad2deg(np.arccos(np.clip(track.world_from_object[:, 2, 2], -1, 1))).max()
         if tilt > 30:
@@ -259,7 +320,7 @@ def _check_course(track: Track, where: str) -> Findings:
 
 def _check_relations(scene: Scene) -> Findings:
     if not scene.sweeps:
-        yield _note("sweeps", "no LiDAR: there is nothing to fuse")
+        yield _warning("sweeps", WITHOUT_LIDAR)
     sweep_times = np.array([sweep.time_s for sweep in scene.sweeps])
     frame_times = np.array([frame.view.time_s for frame in scene.frames])
     if len(sweep_times):
@@ -305,7 +366,22 @@ def check_points(scene: Scene, sweep: Sweep, points: SweepPoints) -> Findings:
     if len(points.xyz) == 0:
         yield _warning(where, "it has no points")
         return
-    reach = np.median(np.linalg.norm(points.xyz, axis=1))
+    zeros = int(at_sensor(points, sweep.time_s, sweep.world_from_lidar, scene.ego).sum())
+    if zeros:
+        yield _warning(
+            where,
+            f"{zeros} of {len(points.xyz)} points lie within {LEAST_RANGE_M:g} m of the LiDAR: beams without a return? "
+            "leave them out, or ingest the log again",
+        )
+    ranges = np.linalg.norm(points.xyz, axis=1)
+    farthest = int((ranges > ranges.max() * (1 - 1e-5)).sum())
+    if farthest >= max(_SAME_RANGE_POINTS, _SAME_RANGE_SHARE * len(ranges)):
+        yield _warning(
+            where,
+            f"{farthest} of {len(ranges)} points lie at the same largest range, {ranges.max():.2f} m: does it mark beams without a return? "
+            "leave them out",
+        )
+    reach = np.median(ranges)
     if reach > 500:
         far = f"half of its points are farther than {reach:.0f} m"
         yield _warning(where, f"{far}; are they metres in the LiDAR's frame?")

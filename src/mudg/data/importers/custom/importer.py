@@ -17,7 +17,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import EgoPath, Frame, Scene, Sweep, SweepPoints, View
 from mudg.data.importers.clouds import Cloud, read_cloud
-from mudg.data.importers.common import UNITS_PER_SECOND, deskew, nearest_index, pose_near
+from mudg.data.importers.common import UNITS_PER_SECOND, deskew, has_pose, mended_path, nearest_index, pose_near
 from mudg.data.importers.custom.schema import INDEX, CustomLog, LogItem, LogLidar, read_log
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import fit_images, image_notes
@@ -50,7 +50,9 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
         InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
-    content = _chosen(read_log(source), options)
+    read, notes = read_log(source), []
+    read = replace(read, ego=mended_path(read.ego, options, notes))
+    content = _chosen(read, options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     images, sweeps = _numbered(content.images), _numbered(content.sweeps)
     moments = _moments(content.images)
@@ -67,9 +69,9 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
             points = read_sweep(content, record, options)
             yield SceneSweep(record.sensor, number, record.time_s, pose_of(content.ego, record), points)
 
-    source = replace(content.source, notes=(*content.source.notes, *image_notes(fits)))
+    origin = replace(content.source, notes=(*content.source.notes, *notes, *image_notes(fits)))
     scene = SceneContent(
-        content.name, source, fits, [*images, *sweeps], convert, _id_of, content.ego, lambda: (content.tracks, ())
+        content.name, origin, fits, [*images, *sweeps], convert, _id_of, content.ego, lambda: (content.tracks, ())
     )
     return write_scene(scene, out, options)
 
@@ -118,15 +120,14 @@ def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
     found = [record for record in records if (content.root / record.file.path).is_file()]
     if len(found) < len(records):
         log.warn(f"custom: left out {len(records) - len(found)} records whose {records[0].kind} is missing")
-    return [r for r in found if r.world_from_sensor is not None or _covered(content.ego, r.time_s)]
-
-
-def _covered(ego: EgoPath, time_s: float) -> bool:
-    try:
-        pose_near(ego, time_s)
-    except InputError:
-        return False
-    return True
+    placed = [r for r in found if r.world_from_sensor is not None or has_pose(content.ego, r.time_s)]
+    if len(placed) < len(found):
+        times = [r.time_s for r in found if r not in placed]
+        log.warn(
+            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from {min(times):.3f} to "
+            f"{max(times):.3f} s"
+        )
+    return placed
 
 
 def _numbered(records: Sequence[LogItem]) -> list[Numbered]:
@@ -180,7 +181,8 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
         remedy = "export it again, or take the sweep out of log.json"
         raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)
     dt_s = _delays(cloud, sweep, content, path)
-    points = SweepPoints(cloud.xyz.astype(np.float32), _intensity(cloud, lidar, sweep.sensor, path), dt_s)
+    intensity = _intensity(cloud, lidar, sweep.sensor, path)
+    points = SweepPoints(cloud.xyz.astype(np.float32), intensity, dt_s, no_returns=cloud.missing)
     if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
         return points
     if not lidar.time_field:
@@ -193,7 +195,7 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
     def world_from_lidar(time_s: float) -> NDArray[np.float64]:
         return pose_near(content.ego, time_s) @ sweep.ego_from_sensor
 
-    return SweepPoints(deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s), points.intensity, points.dt_s)
+    return replace(points, xyz=deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s))
 
 
 def _field(cloud: Cloud, name: str, what: str, path: Path, remedy: str = "") -> NDArray[Any]:
@@ -270,7 +272,13 @@ def check_log(source: Path) -> list[Finding]:
         yield from scene_check.check_image(frame, pixels)
 
     def check_sweep(sweep: Sweep, cloud: LogItem) -> Iterator[Finding]:
-        yield from scene_check.check_points(scene, sweep, read_sweep(content, cloud, ImportOptions()))
+        points = read_sweep(content, cloud, ImportOptions())
+        if points.no_returns:
+            rows = points.no_returns + len(points.xyz)
+            yield Finding(
+                "note", f"sweep {sweep.id}", f"{points.no_returns} of {rows} points mark beams without a return; ingest leaves them out"
+            )
+        yield from scene_check.check_points(scene, sweep, points)
 
     with log.task("checking images and sweeps", len(images) + len(sweeps)) as bar:
         checks = [
@@ -300,9 +308,7 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
             else:
                 sweeps[record] = Sweep(name, record.sensor, record.time_s, pose, record.file)
         except InputError as problem:
-            remedy = "are the clocks the same? --skip-missing leaves such records out"
-            where = f"{record.kind} {record.file.path}"
-            complain(InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=remedy))
+            complain(problem.located(f"{record.kind} {record.file.path}"))
     groups: dict[int, list[str]] = {}
     for record, moment in _moments(list(frames)).items():
         groups.setdefault(moment, []).append(frames[record].id)

@@ -69,7 +69,7 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
     skip = 2 if frame is None else 0
-    for index, line in enumerate(read_lines(path)):
+    for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
         if len(columns) - skip not in (15, 16):
             raise InputError("label line has the wrong number of columns", where=where, got=str(len(columns)),

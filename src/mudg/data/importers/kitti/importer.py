@@ -22,8 +22,8 @@ keep ``dt_s`` = 0.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -35,7 +35,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
 from mudg.data.importers import layout
-from mudg.data.importers.common import pose_near, seconds
+from mudg.data.importers.common import has_pose, mended_path, origin_note, pose_near, seconds
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.data.importers.kitti import LICENCE
@@ -43,7 +43,7 @@ from mudg.data.importers.kitti import boxes as kitti_boxes
 from mudg.data.importers.kitti import poses as kitti_poses
 from mudg.data.importers.kitti.calib import KittiCalibration, read_calibration_day, read_calibration_text
 from mudg.data.importers.kitti.info import import_info_frame
-from mudg.data.importers.kitti.scans import SENSOR, read_scan, untwist_scan
+from mudg.data.importers.kitti.scans import SENSOR, TURN_PERIOD_S, read_scan, untwist_scan
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 
@@ -132,12 +132,15 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     if (source / "info.json").is_file() and not any((source / name).is_dir() for name in ("image_02", "image_2")):
         return import_info_frame(source, out, options)
     files = find_files(source, options)
-    frames = _choose_frames(files, options)
+    stamps = _read_stamps(files, options)
+    frames = _choose_frames(files, stamps, options)
     notes: list[str] = []
     calibration = _find_calibration(files, frames, options)
-    clock = _find_clock(files, frames, notes)
+    clock = _make_clock(files, stamps, frames, notes)
     recording = _Recording(files, frames, calibration, clock)
     motion = _find_motion(recording, options, notes)
+    frames = _with_poses(recording, motion, options)
+    recording = replace(recording, frames=frames)
     world_from_velo = {n: motion.velo_at(clock.scan_s[n]) for n in frames}
     tracks, track_notes = _find_tracks(recording, world_from_velo, motion, options)
     notes += track_notes
@@ -218,12 +221,14 @@ def _refuse_without_images(source: Path, options: ImportOptions) -> None:
         remedy="give the folder of one drive, sequence or training set")  # fmt: skip
 
 
-def _choose_frames(files: KittiFiles, options: ImportOptions) -> list[int]:
-    """Frame numbers to import: those of all chosen cameras and scans."""
+def _choose_frames(files: KittiFiles, stamps: Mapping[str, Mapping[int, float]], options: ImportOptions) -> list[int]:
+    """Frame numbers to import: those of all chosen cameras and scans that have a time stamp, where there are any."""
     if files.single:
         return [_single_frame(files, options)]
     streams = {**files.images, **({SENSOR: files.scans} if files.scans else {})}
-    frames = layout.complete_frames(streams, options, str(files.folder), "kitti")
+    recorded = set().union(*streams.values())
+    stamped = {f"timestamps of {name}": recorded - (set(streams[name]) - set(times)) for name, times in stamps.items()}
+    frames = layout.complete_frames({**streams, **stamped}, options, str(files.folder), "kitti")
     if not files.scans:
         log.warn("kitti: no scans found: the scene has images only, and there is nothing to fuse")
     return frames
@@ -266,36 +271,62 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
 # --- time and motion ------------------------------------------------------------------------------------------------
 
 
-def _find_clock(files: KittiFiles, frames: Sequence[int], notes: list[str]) -> _Clock:
-    """The recording's clock: measured, or 10 Hz from the first frame on, which is noted."""
+def _read_stamps(files: KittiFiles, options: ImportOptions) -> dict[str, dict[int, float]]:
+    """The source's times in seconds by camera or LiDAR and frame; nothing where a camera has none."""
     common = files.folder / "times.txt"
-    image_folders = {name: next(path.parent for path in found.values()) for name, found in files.images.items()}
-    image_files = {
+    folders = {name: next(path.parent for path in found.values()) for name, found in files.images.items()}
+    paths = {
         name: layout.first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", common)
-        for name, folder in image_folders.items()
+        for name, folder in folders.items()
     }
-    if files.single or None in image_files.values():
+    if files.single or None in paths.values():
+        return {}
+    streams = dict(files.images)
+    if files.scans:
+        paths[SENSOR] = layout.first_file(files.folder / "velodyne_points" / "timestamps.txt", common, *paths.values())
+        streams[SENSOR] = files.scans
+    first, end = options.frames or (0, 2**63)
+    stamps = {}
+    for name, path in paths.items():
+        wanted = [n for n in streams[name] if first <= n < end]
+        if path is not None:
+            stamps[name] = kitti_poses.read_timestamps(path, list(streams[name]), max(wanted, default=-1))
+    return stamps
+
+
+def _make_clock(
+    files: KittiFiles, stamps: Mapping[str, Mapping[int, float]], frames: Sequence[int], notes: list[str]
+) -> _Clock:
+    """The recording's clock: measured, or 10 Hz from the first frame on, which is noted."""
+    if not stamps:
         if not files.single:
             notes.append("no timestamps in the source: 10 Hz assumed, image and scan of a frame at one moment")
         assumed = {n: (n - frames[0]) * FRAME_PERIOD_S for n in frames}
         return _Clock(dict.fromkeys(files.images, assumed), assumed, 0.0, False)
-    image_s = {name: _times_of(path, frames) for name, path in image_files.items() if path is not None}
-    scan_file = layout.first_file(files.folder / "velodyne_points" / "timestamps.txt", common) if files.scans else None
-    scan_s = _times_of(scan_file, frames) if scan_file is not None else next(iter(image_s.values()))
-    for stream, times in (*image_s.items(), (SENSOR, scan_s)):
-        seconds([times[n] for n in frames], "s", f"{files.folder}: {stream}")
+    chosen = {name: {n: times[n] for n in frames} for name, times in stamps.items()}
+    for stream, times in chosen.items():
+        seconds(list(times.values()), "s", f"{files.folder}: {stream}")
+    scan_s = chosen.get(SENSOR, next(iter(chosen.values())))
     start_s = scan_s[frames[0]]
-    since_start = {name: {n: t - start_s for n, t in times.items()} for name, times in image_s.items()}
+    since_start = {name: {n: t - start_s for n, t in times.items()} for name, times in chosen.items()}
     return _Clock(since_start, {n: t - start_s for n, t in scan_s.items()}, start_s, True)
 
 
-def _times_of(path: Path, frames: Sequence[int]) -> dict[int, float]:
-    times = kitti_poses.read_timestamps(path)
-    if len(times) <= max(frames):
-        raise InputError("timestamps do not cover the frames", where=str(path),
-            expected=f"at least {max(frames) + 1} lines (line k = frame k)", got=f"{len(times)} lines",
-            remedy="is the file cut off?")  # fmt: skip
-    return {n: times[n] for n in frames}
+def _with_poses(recording: _Recording, motion: _VeloMotion, options: ImportOptions) -> list[int]:
+    """Frames whose image and scan lie where the vehicle's path is known; others are refused, or left out if that is asked for."""
+    clock, reach_s = recording.clock, TURN_PERIOD_S / 2 if motion.untwist else 0.0
+    placed = []
+    for n in recording.frames:
+        times = [*(found[n] for found in clock.image_s.values()), clock.scan_s[n] - reach_s, clock.scan_s[n] + reach_s]
+        if not options.skip_missing or all(has_pose(motion.ego, time_s) for time_s in times):
+            placed.append(n)
+    lost = sorted({*recording.frames} - {*placed})
+    if not placed:
+        motion.velo_at(clock.scan_s[lost[0]])  # says what is wrong
+        raise InputError("no frame has a vehicle pose", where=str(recording.files.folder))
+    if lost:
+        log.warn(f"kitti: left out frames without a vehicle pose: {layout.number_ranges(lost)}")
+    return placed
 
 
 def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]) -> _VeloMotion:
@@ -305,8 +336,7 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
     files, frames, calibration = recording.files, recording.frames, recording.calibration
     packets = _find_packets(files, options)
     if packets is None:
-        poses = _poses_from_file(recording, options, notes)
-        ego = EgoPath(np.array([recording.clock.scan_s[n] for n in frames]), poses)
+        ego = _ego_from_file(recording, options, notes)
         ego_from_velo, untwist = np.eye(4), options.untwist == "yes"
     else:
         if calibration.velo_from_imu is None:
@@ -314,24 +344,25 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
                 expected="calib_imu_to_velo.txt or Tr_imu_to_velo", remedy="add it, or give a pose file with --poses")  # fmt: skip
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
-        ego = _ego_from_packets(packets, frames, recording.clock)
+        ego = _ego_from_packets(packets, frames, recording.clock, options)
         raw_scans = any(path.parent.name == "data" for path in files.scans.values())
         ego_from_velo = invert(calibration.velo_from_imu)
         untwist = options.untwist == "yes" or (options.untwist == "auto" and raw_scans)
+    ego = mended_path(ego, options, notes)
     untwist = untwist and len(frames) > 1
     if untwist:
         notes.append("scans untwisted: counter-clockwise turn of 0.1 s, forward at the scan's time")
     return _VeloMotion(ego, ego_from_velo, untwist)
 
 
-def _poses_from_file(recording: _Recording, options: ImportOptions, notes: list[str]) -> Matrix:
-    """World-from-velodyne f64[n, 4, 4]; the world is the velodyne of the first frame."""
+def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[str]) -> EgoPath:
+    """The velodyne's path at the scans; the world is the velodyne of the first frame."""
     frames, folder = recording.frames, recording.files.folder
     names = ("poses_velo.txt", "poses.txt", "poses_cam0.txt")
     found = [parent / name for parent in (folder, folder / "derived") for name in names]
     path = options.poses or layout.first_file(*found, *_odometry_poses(folder))
     if path is None and len(frames) == 1:
-        return np.eye(4)[None]
+        return EgoPath(np.array([recording.clock.scan_s[frames[0]]]), np.eye(4)[None])
     if path is None:
         raise InputError("no vehicle poses found", where=str(folder),
             expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
@@ -339,15 +370,24 @@ def _poses_from_file(recording: _Recording, options: ImportOptions, notes: list[
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
-    missing = [n for n in frames if n not in poses]
-    if missing:
-        raise InputError("pose file lacks frames", where=str(path), got=f"no pose for frames {layout.number_ranges(missing)}",
-            remedy="choose frames with --frames FIRST:END, or give another file with --poses")  # fmt: skip
-    stacked = np.stack([poses[n] for n in frames])
+    known = _known(frames, poses, "pose file lacks frames", path, options)
+    stacked = np.stack([poses[n] for n in known])
     if sensor == "cam0":
         rect0_from_velo = recording.calibration.rect0_from_velo
         stacked = invert(rect0_from_velo) @ stacked @ rect0_from_velo
-    return invert(stacked[0]) @ stacked
+    notes.append(origin_note(stacked[0]))
+    return EgoPath(np.array([recording.clock.scan_s[n] for n in known]), invert(stacked[0]) @ stacked)
+
+
+def _known(
+    frames: Sequence[int], there: Container[int], what: str, path: Path, options: ImportOptions
+) -> list[int]:
+    """The frames that are ``there``; lost ones are refused unless frames may be left out."""
+    missing = [n for n in frames if n not in there]
+    if missing and (not options.skip_missing or len(missing) == len(frames)):
+        raise InputError(what, where=str(path), got=f"nothing for frames {layout.number_ranges(missing)}",
+            remedy="copy them, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+    return [n for n in frames if n in there]
 
 
 def _find_packets(files: KittiFiles, options: ImportOptions) -> Path | None:
@@ -365,17 +405,19 @@ def _odometry_poses(source: Path) -> tuple[Path, ...]:
     return (source.parent.parent / "poses" / f"{source.name}.txt",) if source.parent.name == "sequences" else ()
 
 
-def _ego_from_packets(path: Path, frames: Sequence[int], clock: _Clock) -> EgoPath:
+def _ego_from_packets(path: Path, frames: Sequence[int], clock: _Clock, options: ImportOptions) -> EgoPath:
     packets = kitti_poses.read_packets(path, frames)
-    numbers = list(packets)
+    _known(frames, packets, "GPS/IMU packets are missing", path, options)
     times_file = path.parent / "timestamps.txt"
+    numbers = list(packets)
     if clock.measured and times_file.is_file():
-        measured = _times_of(times_file, numbers)
+        measured = kitti_poses.read_timestamps(times_file, numbers, numbers[-1])
+        numbers = _known(numbers, measured, "GPS/IMU packets have no timestamps", times_file, options)
         times = np.array([measured[n] for n in numbers]) - clock.start_s
     else:
         times = np.interp(numbers, frames, [clock.scan_s[n] for n in frames])
     later = np.r_[True, np.diff(np.maximum.accumulate(times)) > 0]
-    poses = kitti_poses.poses_from_packets(np.stack(list(packets.values())), str(path))
+    poses = kitti_poses.poses_from_packets(np.stack([packets[n] for n in numbers]), str(path))
     return EgoPath(times[later], poses[later])
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import store
+from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, yaw_matrix, yaw_of
 from mudg.data.importers.common import rigid_pose
@@ -20,9 +20,9 @@ EARTH_RADIUS_M = 6378137.0
 _OXTS_VALUES = 30
 
 
-def read_lines(path: Path) -> list[str]:
-    """Non-empty lines of a text file."""
-    return [line for line in store.read_text(path).splitlines() if line.strip()]
+def read_lines(path: Path) -> dict[int, str]:
+    """The lines of a text file by their number, from 0. An empty one is a record that is missing: it is left out, and keeps its number."""
+    return {number: line for number, line in enumerate(store.read_text(path).splitlines()) if line.strip()}
 
 
 def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDArray[np.float64]:
@@ -44,8 +44,8 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     """Poses by frame number, and which sensor they are of.
 
     Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
-    for the k-th frame (or, when the file covers more than our frames, for frame number k); 13 = frame number, then
-    row-major 3x4 of the velodyne in a z-up world.
+    for frame number k (or, in a file that has just one line per frame, for the k-th frame); 13 = frame number, then
+    row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose.
 
     Returns:
         Poses f64[4, 4] by frame number, and ``"cam0"`` or ``"velo"``.
@@ -53,46 +53,42 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     lines = read_lines(path)
     if not lines:
         raise InputError("pose file is empty", where=str(path), expected="one pose a line")
-    rows = [line_numbers(line, (12, 13), f"{path}: line {index + 1}", "pose") for index, line in enumerate(lines)]
-    widths = {len(row) for row in rows}
+    rows = {n: line_numbers(line, (12, 13), f"{path}: line {n + 1}", "pose") for n, line in lines.items()}
+    widths, count = {len(row) for row in rows.values()}, max(rows) + 1
     if len(widths) != 1:
         raise InputError("pose file mixes two forms", where=str(path), expected="12 or 13 numbers in every line")
     if widths == {13}:
-        poses = {int(row[0]): row[1:] for row in rows}
-        if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows, strict=True)):
+        poses = {int(row[0]): row[1:] for row in rows.values()}
+        if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows.values(), strict=True)):
             raise InputError("first column is not a list of distinct frame numbers", where=str(path))
-    elif len(rows) == len(frame_numbers):
-        poses = dict(zip(frame_numbers, rows, strict=True))
-    elif len(rows) > max(frame_numbers):
-        poses = dict(enumerate(rows))
+    elif count > max(frame_numbers):
+        poses = rows
+    elif len(rows) == count == len(frame_numbers):
+        poses = dict(zip(frame_numbers, rows.values(), strict=True))
+        if frame_numbers[-1] - frame_numbers[0] >= count:
+            log.warn(f"kitti: {path} has a line for each of the {count} frames: line k is taken for the k-th of them, gaps or not")
     else:
         expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
-        raise InputError("pose file does not cover the frames", where=str(path), got=f"{len(rows)} lines",
+        raise InputError("pose file does not cover the frames", where=str(path), got=f"{count} lines",
             expected=expected)  # fmt: skip
     sensor = "velo" if widths == {13} else "cam0"
     return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
 
 def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
-    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``.
+    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``; empty files and lines are missing packets.
 
     Args:
         path: a folder with one file per frame (raw data), or one file with a line per frame (tracking).
-        frames: frame numbers that must be there.
     """
     if path.is_dir():
         found = {int(file.stem): file for file in path.iterdir() if file.stem.isdigit() and file.suffix == ".txt"}
         wheres = {n: str(file) for n, file in sorted(found.items()) if frames[0] <= n <= frames[-1]}
-        lines = {n: (read_lines(found[n]) or [""])[0] for n in wheres}
+        texts = {n: list(read_lines(found[n]).values()) for n in wheres}
+        lines = {n: text[0] for n, text in texts.items() if text}
     else:
-        rows = dict(enumerate(read_lines(path)))
-        lines = {n: line for n, line in rows.items() if frames[0] <= n <= frames[-1]}
+        lines = {n: line for n, line in read_lines(path).items() if frames[0] <= n <= frames[-1]}
         wheres = {n: f"{path}: line {n + 1}" for n in lines}
-    missing = [n for n in frames if n not in lines]
-    if missing:
-        raise InputError("GPS/IMU packets are missing", where=str(path),
-            got=f"no packet for frames {', '.join(str(n) for n in missing[:8])} ({len(missing)} in all)",
-            remedy="copy them, or choose frames with --frames FIRST:END")  # fmt: skip
     return {n: line_numbers(line, (_OXTS_VALUES,), wheres[n], "GPS/IMU packet") for n, line in lines.items()}
 
 
@@ -126,18 +122,38 @@ def _roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
     return yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
 
 
-def read_timestamps(path: Path) -> list[float]:
-    """Seconds per line: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch)."""
-    times = []
-    for index, line in enumerate(read_lines(path)):
-        where = f"{path}: line {index + 1}"
-        match = re.fullmatch(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,12})?", line.strip())
-        if match is None:
-            times.append(float(line_numbers(line, (1,), where, "timestamp")[0]))
-            continue
-        try:
-            second = datetime.datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=datetime.UTC)
-        except ValueError as error:
-            raise InputError("timestamp is no date", where=where, got=line.strip()) from error
-        times.append(second.timestamp() + float(match[2] or 0))
-    return times
+def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, float]:
+    """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
+
+    Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for that, but has just one
+    line per recorded file, counts those instead.
+
+    Args:
+        numbers: of the recorded files, increasing.
+        last: the highest number that is needed.
+
+    Raises:
+        InputError: no times, or too few.
+    """
+    lines = read_lines(path)
+    stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}
+    count = len(store.read_text(path).splitlines())
+    if count > last:
+        return stamps
+    if len(stamps) == max(stamps, default=-1) + 1 == len(numbers) > 0:
+        log.warn(f"kitti: {path} has a line for each of the {len(numbers)} files: line k is taken for the k-th of them, gaps or not")
+        return dict(zip(numbers, stamps.values(), strict=True))
+    raise InputError("timestamps do not cover the frames", where=str(path), got=f"{count} lines, {len(numbers)} files",
+        expected=f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file",
+        remedy="is the file cut off?")  # fmt: skip
+
+
+def _stamp(line: str, where: str) -> float:
+    match = re.fullmatch(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,12})?", line.strip())
+    if match is None:
+        return float(line_numbers(line, (1,), where, "timestamp")[0])
+    try:
+        second = datetime.datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+    except ValueError as error:
+        raise InputError("timestamp is no date", where=where, got=line.strip()) from error
+    return second.timestamp() + float(match[2] or 0)

@@ -7,6 +7,7 @@ turns later.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -25,14 +26,16 @@ _TURN_STEPS: Final = 36
 
 
 def read_scan(path: Path) -> SweepPoints:
-    """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Rows at the origin (no return) are dropped.
+    """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
 
     Raises:
         InputError: cut off, or values that are not finite.
     """
-    rows = read_float_rows(path, 4)
-    rows = rows[np.any(rows[:, :3] != 0, axis=1)]
-    return SweepPoints(np.ascontiguousarray(rows[:, :3]), np.clip(rows[:, 3], 0, 1), np.zeros(len(rows), np.float32))
+    rows, returns = read_float_rows(path, 4)
+    rows = rows[returns]
+    dt_s = np.zeros(len(rows), np.float32)
+    no_returns = int((~returns).sum())
+    return SweepPoints(np.ascontiguousarray(rows[:, :3]), np.clip(rows[:, 3], 0, 1), dt_s, no_returns=no_returns)
 
 
 def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
@@ -57,4 +60,4 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
     moments_s = np.linspace(-0.5, 0.5, _TURN_STEPS + 1) * TURN_PERIOD_S
     corrections = [velo_from_world @ velo_at(time_s + float(moment)) for moment in moments_s]
     place = (dt_s / TURN_PERIOD_S + 0.5) * _TURN_STEPS
-    return SweepPoints(blend_motion(points.xyz, corrections, place), points.intensity, dt_s)
+    return replace(points, xyz=blend_motion(points.xyz, corrections, place), dt_s=dt_s)

@@ -21,7 +21,7 @@ from mudg.base.types import Camera
 from mudg.data.importers.common import rigid_pose, rigid_rotation
 from mudg.data.importers.images import ImageFit, brown_conrady, fit_images
 from mudg.data.importers.kitti.calib import pinhole_camera, read_number_table, table_entry
-from mudg.data.importers.kitti.poses import line_numbers, read_lines
+from mudg.data.importers.kitti.poses import line_numbers
 from mudg.data.importers.options import ImportOptions
 
 Matrix = NDArray[np.float64]
@@ -117,7 +117,7 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
 
 
 def _rigid_file(path: Path) -> Matrix:
-    numbers = line_numbers(" ".join(read_lines(path)), (12,), str(path), "calibration")
+    numbers = line_numbers(store.read_text(path).replace("\n", " "), (12,), str(path), "calibration")
     return rigid_pose(numbers.reshape(3, 4), str(path))
 
 

@@ -28,7 +28,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,7 +44,15 @@ from mudg.base.types import EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_float_rows
-from mudg.data.importers.common import deskew, pose_near, rigid_pose, seconds, world_from_first
+from mudg.data.importers.common import (
+    deskew,
+    mended_path,
+    origin_note,
+    pose_near,
+    rigid_pose,
+    seconds,
+    world_from_first,
+)
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, image_notes, image_size
 from mudg.data.importers.kitti import poses as kitti_poses
@@ -53,6 +61,7 @@ from mudg.data.importers.kitti360.boxes import LABEL_OF, Kitti360Box, read_boxes
 from mudg.data.importers.kitti360.calib import IMU_FROM_EGO, Kitti360Calibration, read_calibration
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.motion import GAP_M
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
@@ -60,8 +69,6 @@ CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "
 USUAL: Final = ("image_00", "image_01")
 SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
-MAX_GAP_M: Final = 3.0
-"""Frames without a pose are interpolated where the vehicle moved less than this between the poses around them."""
 _SICK_REACH_S: Final = 0.055
 _TRAIN_IDS: Final = {
     7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15,
@@ -125,12 +132,14 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     clock = _clock(folders, streams, notes)
     poses = _find_poses(folders, options)
     notes.append(f"poses from {poses.name}")
-    ego = _read_motion(poses, calibration, clock)
+    ego = mended_path(_read_motion(poses, calibration, clock), options, notes)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
     frames = layout.complete_frames(placed, options, str(folders.root), "kitti360")
     notes += _without_pose(streams.values(), placed.values(), options)
     start_s = float(clock[frames[0]])
-    world_from_source = world_from_first(pose_near(ego, clock[frames[0]]))
+    first = pose_near(ego, clock[frames[0]])
+    world_from_source = world_from_first(first)
+    notes.append(origin_note(first))
     scene_s = seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
     ego = EgoPath(ego.times_s - start_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[n]: calibration.fit(n, CAMERAS[n], image_size(images[n][frames[0]]), options) for n in chosen}
@@ -219,21 +228,10 @@ def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: 
 
 
 def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
-    """Seconds by number, f64[last + 1]. Line k is number k; a file with just one line per recorded file counts those instead.
-
-    Empty lines are numbers without a stamp (NaN).
-    """
-    given = [bool(line.strip()) for line in store.read_bytes(path).decode("utf-8", "replace").splitlines()]
-    times = np.full(max(len(given), last + 1), np.nan)
-    stamps = kitti_poses.read_timestamps(path)
-    if len(given) > last:
-        times[: len(given)][given] = stamps
-    elif len(stamps) == len(files) > 0:
-        times[list(files)] = stamps
-    else:
-        raise InputError("timestamps do not cover the frames", where=str(path),
-            got=f"{len(given)} lines, {len(files)} files",
-            expected=f"at least {last + 1} lines (line k = frame k), or one per file", remedy="is the file cut off?")  # fmt: skip
+    """Seconds by number, f64[last + 1] or more; NaN where there is no stamp. See ``read_timestamps``."""
+    stamps = kitti_poses.read_timestamps(path, list(files), last)
+    times = np.full(max(last, *stamps, 0) + 1, np.nan)
+    times[list(stamps)] = list(stamps.values())
     return times
 
 
@@ -249,7 +247,7 @@ def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
 def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np.float64]) -> EgoPath:
     """The vehicle at the frames that have a pose, in the data set's world and clock."""
     numbers, poses, before = [], [], -1
-    for index, line in enumerate(kitti_poses.read_lines(path)):
+    for index, line in kitti_poses.read_lines(path).items():
         where = f"{path}: line {index + 1}"
         row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
         number = int(row[0])
@@ -272,7 +270,7 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
 
 
 def _has_pose(ego: EgoPath, time_s: float) -> bool:
-    """Whether there is a pose at a time, or it can be interpolated. NaN: no."""
+    """Whether there is a pose at a time, or the vehicle moved less than ``GAP_M`` between the poses around it. NaN: no."""
     if not np.isfinite(time_s):
         return False
     after = int(np.searchsorted(ego.times_s, time_s))
@@ -281,7 +279,7 @@ def _has_pose(ego: EgoPath, time_s: float) -> bool:
     if after in (0, len(ego.times_s)):
         return False
     moved = ego.world_from_ego[after, :3, 3] - ego.world_from_ego[after - 1, :3, 3]
-    return bool(np.linalg.norm(moved) < MAX_GAP_M)
+    return bool(np.linalg.norm(moved) < GAP_M)
 
 
 def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
@@ -289,7 +287,7 @@ def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibrati
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
     xyz = deskew(points.xyz, dt_s, lambda t: pose_near(ego, t) @ calibration.ego_from_velo, time_s)
-    return SweepPoints(xyz, points.intensity, dt_s)
+    return replace(points, xyz=xyz, dt_s=dt_s)
 
 
 # --- SICK lines -------------------------------------------------------------------------------------------------------
@@ -321,26 +319,27 @@ class _SickLines:
     def sweeps(self, index: int, time_s: float) -> Iterable[SceneSweep]:
         """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
         pose = pose_near(self.ego, time_s) @ self.ego_from_sick
-        parts, delays = [], []
+        parts, delays, no_returns = [], [], 0
         for number in np.flatnonzero(np.abs(self.times_s - time_s) < _SICK_REACH_S):
             late = float(self.times_s[number] - time_s)
             nearer = late >= FRAME_PERIOD_S / 2 or late < -FRAME_PERIOD_S / 2
             if int(number) not in self.files or nearer:
                 continue
-            line = _read_line(self.files[int(number)])
+            line, without = _read_line(self.files[int(number)])
+            no_returns += without
             parts.append(transform_points(invert(pose) @ pose_near(self.ego, time_s + late) @ self.ego_from_sick, line))
             delays.append(np.full(len(line), late, np.float32))
         xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
         if len(xyz):
-            points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays))
+            points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays), no_returns=no_returns)
             yield SceneSweep(SICK, index, time_s, pose, points)
 
 
-def _read_line(path: Path) -> NDArray[np.float32]:
-    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane; source: the data set's reader."""
-    pairs = read_float_rows(path, 2, "SICK line")
-    pairs = pairs[np.any(pairs != 0, axis=1)]
-    return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1)
+def _read_line(path: Path) -> tuple[NDArray[np.float32], int]:
+    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane (source: the data set's reader); and its beams without a return."""
+    pairs, returns = read_float_rows(path, 2, "SICK line", axes=2)
+    pairs = pairs[returns]
+    return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1), int((~returns).sum())
 
 
 # --- labels and boxes -------------------------------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: there are several recordings and none was chosen, or no such camera.
         InputError: missing, damaged or contradictory; nothing is left at ``out``. ResourceError: the package is not installed.
     """
-    refuse_options(options, "NCore", "poses", "boxes")
+    refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()
     stores = _choose(source, options)
     for path in stores:
@@ -446,7 +446,7 @@ def _points(
     if len(times) and not begin <= times.min() <= times.max() <= end:
         raise InputError("points were measured outside of their sweep", where=where, expected=f"{begin} to {end} us",
             got=f"{times.min()} to {times.max()}")  # fmt: skip
-    _, which = there = np.nonzero(np.isfinite(distance))
+    _, which = there = np.nonzero(np.isfinite(distance) & (distance != 0))  # NaN is how the format says that nothing came back
     xyz, times, seen = ray[which] * distance[there][:, None], times[which], intensity[there]
     length = np.linalg.norm(ray, axis=1)
     if not np.isfinite(xyz).all() or (np.abs(length - 1) > 1e-3).any() or (distance[there] < 0).any():
@@ -461,7 +461,8 @@ def _points(
     moved = np.linalg.inv(world_from_lidar) @ recording.at_points(lidar, moments, where)
     xyz = np.einsum("nij,nj->ni", moved[index, :3, :3], xyz) + moved[index, :3, 3]
     dt_s = ((times - at) / MICRO).astype(np.float32)
-    return SweepPoints(xyz.astype(np.float32), seen, dt_s, None if classes is None else classes[which])
+    given, no_returns = None if classes is None else classes[which], int((distance == 0).sum())
+    return SweepPoints(xyz.astype(np.float32), seen, dt_s, given, no_returns)
 
 
 def _classes(reader: Any, frame: int, count: int) -> NDArray[np.uint8] | None:

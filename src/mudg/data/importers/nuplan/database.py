@@ -17,11 +17,14 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg.base.checks import foreign_name
 from mudg.base.errors import InputError
+from mudg.base.geometry import invert
 from mudg.data.importers.columns import require_columns
 from mudg.data.importers.common import pose_from_quaternion
 from mudg.data.importers.layout import path_inside
 from mudg.data.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
+from mudg.data.scene.schema import ref_problem
 
 Matrix = NDArray[np.float64]
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
@@ -37,7 +40,9 @@ SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
     "scene": ("token", "name"),
 }
 """Tables and columns that are read."""
-_MAX_CELL_BYTES: Final = 16 * 1024 * 1024
+_MAX_CELL_BYTES: Final = 1024 * 1024
+"""Calibrations are the longest values, of a few hundred bytes."""
+_MAX_TOKEN_BYTES: Final = 64
 _MAX_NUMBERS: Final = 64
 _DATA_TYPES: Final = "nuplan.database.common.data_types"
 _MAKERS: Final[Mapping[str, Maker | None]] = {
@@ -59,12 +64,14 @@ class NuplanCamera:
 
 @dataclass(frozen=True, slots=True)
 class NuplanCloud:
-    """One point cloud: its token, file, time (us), and world-from-lidar f64[4, 4] in the log's world."""
+    """One point cloud: its token, file, time (us), world-from-lidar f64[4, 4] in the log's world, and where the log's LiDARs sit in the
+    cloud's frame, f64[3] each."""
 
     token: bytes
     file: Path
     time_us: int
     world_from_lidar: Matrix
+    places: tuple[Matrix, ...]
 
 
 class NuplanLog:
@@ -99,8 +106,11 @@ class NuplanLog:
     def name(self) -> str:
         """The log's name, e.g. ``2021.05.12.22.00.38_veh-35_01008_01518``."""
         for (name,) in self.rows("SELECT logfile FROM log"):
-            if isinstance(name, str) and name:
-                return name
+            name = text_of(name, f"{self.path}: log.logfile")
+            problem = "has folders in it" if "/" in name else ref_problem(name)
+            if problem is not None:
+                raise InputError(f"log's name {problem}", where=f"{self.path}: log.logfile", got=repr(name), expected="a folder's name")
+            return name
         raise InputError("log has no name", where=f"{self.path}: log.logfile")
 
     def cameras(self) -> dict[bytes, NuplanCamera]:
@@ -109,34 +119,35 @@ class NuplanLog:
         for token, channel, *values in self.rows(
             "SELECT token, channel, translation, rotation, intrinsic, distortion, width, height FROM camera"
         ):
+            channel = text_of(channel, f"{self.path}: camera.channel")
             where = f"{self.path}: camera {channel}"
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
             skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
             if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
                 raise InputError("intrinsics are not of a pinhole camera", where=f"{where}.intrinsic",
                     got=str(matrix.tolist()), expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")  # fmt: skip
-            found[bytes(token)] = NuplanCamera(
-                str(channel),
+            width, height = (_whole(values[index], f"{where}.{name}") for index, name in ((4, "width"), (5, "height")))
+            found[token_of(token, f"{where}.token")] = NuplanCamera(
+                channel,
                 self._pose(values[0], values[1], where),
                 (float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
                 tuple(self._numbers(values[3], f"{where}.distortion", None)),
-                (int(values[4]), int(values[5])),
+                (width, height),
             )
         return found
 
     def lidars(self) -> dict[bytes, Matrix]:
         """Token -> place on the vehicle f64[4, 4]."""
-        return {
-            bytes(token): self._pose(translation, rotation, f"{self.path}: lidar {channel}")
-            for token, channel, translation, rotation in self.rows(
-                "SELECT token, channel, translation, rotation FROM lidar"
-            )
-        }
+        found = {}
+        for token, channel, *place in self.rows("SELECT token, channel, translation, rotation FROM lidar"):
+            where = f"{self.path}: lidar {text_of(channel, f'{self.path}: lidar.channel')}"
+            found[token_of(token, f"{where}.token")] = self._pose(*place, where)
+        return found
 
     def clouds(self, scene: str) -> Iterator[tuple[bytes, int]]:
         """Token and time (us) of the point clouds in order of time, of one scene or (empty name) of all."""
         return (
-            (bytes(token), self._time(time_us, "lidar_pc"))
+            (token_of(token, f"{self.path}: lidar_pc.token"), self._time(time_us, "lidar_pc"))
             for token, time_us in self.rows(
                 "SELECT p.token, p.timestamp FROM lidar_pc AS p LEFT JOIN scene AS s ON s.token = p.scene_token "
                 "WHERE ? = '' OR s.name = ? ORDER BY p.timestamp",
@@ -144,22 +155,22 @@ class NuplanLog:
             )
         )
 
-    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud:
-        """One point cloud with its pose; its file lies below ``blobs``."""
+    def cloud(self, token: bytes, ego_from_lidar: Mapping[bytes, Matrix], blobs: Path) -> NuplanCloud | None:
+        """One point cloud with its pose; its file lies below ``blobs``. None if the vehicle has no pose then."""
         for lidar, file, time_us, *pose in self.rows(
             "SELECT p.lidar_token, p.filename, p.timestamp, e.x, e.y, e.z, e.qw, e.qx, e.qy, e.qz "
             "FROM lidar_pc AS p JOIN ego_pose AS e ON e.token = p.ego_pose_token WHERE p.token = ?",
             (token,),
         ):
             where = f"{self.path}: lidar_pc {token.hex()}"
-            if bytes(lidar) not in ego_from_lidar:
-                raise InputError("point cloud is of a LiDAR that is not there", where=where, got=bytes(lidar).hex())
-            world_from_lidar = self._ego(pose, where) @ ego_from_lidar[bytes(lidar)]
-            return NuplanCloud(
-                token, path_inside(blobs, file, where), self._time(time_us, "lidar_pc"), world_from_lidar
-            )
-        raise InputError("point cloud has no vehicle pose", where=f"{self.path}: lidar_pc {token.hex()}.ego_pose_token",
-            expected="a token of ego_pose")  # fmt: skip
+            lidar = token_of(lidar, f"{where}.lidar_token")
+            if lidar not in ego_from_lidar:
+                raise InputError("point cloud is of a LiDAR that is not there", where=where, got=lidar.hex())
+            mount = ego_from_lidar[lidar]
+            places = tuple((invert(mount) @ other)[:3, 3] for other in ego_from_lidar.values())
+            path, time_us = path_inside(blobs, file, where), self._time(time_us, "lidar_pc")
+            return NuplanCloud(token, path, time_us, self._ego(pose, where) @ mount, places)
+        return None
 
     def ego_poses(self, first_us: int, last_us: int) -> tuple[NDArray[np.int64], Matrix]:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
@@ -168,8 +179,9 @@ class NuplanLog:
             "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
             (first_us, last_us),
         ):
+            time_us = self._time(time_us, "ego_pose")
             if not times or time_us > times[-1]:
-                times.append(self._time(time_us, "ego_pose"))
+                times.append(time_us)
                 poses.append(self._ego(pose, f"{self.path}: ego_pose at {time_us}"))
         return np.array(times, np.int64), np.array(poses).reshape(-1, 4, 4)
 
@@ -179,8 +191,9 @@ class NuplanLog:
             "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
             (first_us, last_us),
         ):
-            path = path_inside(blobs, file, f"{self.path}: image at {time_us}")
-            yield bytes(camera), path, self._time(time_us, "image")
+            time_us = self._time(time_us, "image")
+            where = f"{self.path}: image at {time_us}"
+            yield token_of(camera, f"{where}: camera_token"), path_inside(blobs, file, where), time_us
 
     def boxes(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, str, tuple[float, ...]]]:
         """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a span.
@@ -193,23 +206,20 @@ class NuplanLog:
             "LEFT JOIN category AS c ON c.token = t.category_token WHERE p.timestamp BETWEEN ? AND ?",
             (first_us, last_us),
         ):
-            where = f"{self.path}: lidar_box of track {bytes(track or b'').hex()}"
+            track = token_of(track, f"{self.path}: lidar_box.track_token").hex()
+            where = f"{self.path}: lidar_box of track {track}"
             if label is None:
                 raise InputError("box names a track or class that is not there", where=where,
                     expected="tokens of track and category", remedy="copy the file again")  # fmt: skip
-            yield bytes(cloud), bytes(track).hex(), str(label), tuple(_finite(number, where) for number in numbers)
+            label = text_of(label, f"{self.path}: category.name")
+            yield token_of(cloud, where), track, label, tuple(_finite(number, where) for number in numbers)
 
     def scenes(self) -> list[str]:
         """Names of the scenes (pieces of up to 20 s)."""
-        return [str(name) for (name,) in self.rows("SELECT name FROM scene ORDER BY name")]
+        return [text_of(name, f"{self.path}: scene.name") for (name,) in self.rows("SELECT name FROM scene ORDER BY name")]
 
     def _time(self, value: Any, table: str) -> int:
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
-        if not isinstance(value, int):
-            raise InputError("timestamp is no whole number", where=f"{self.path}: {table}.timestamp",
-                got=repr(value)[:40])  # fmt: skip
-        return value
+        return _whole(value, f"{self.path}: {table}.timestamp")
 
     def _ego(self, row: list[Any], where: str) -> Matrix:
         x, y, z, *wxyz = (_finite(number, where) for number in row)
@@ -232,6 +242,30 @@ class NuplanLog:
             raise InputError("calibration has the wrong number of values", where=where, expected=str(count),
                 got=str(len(flat)))  # fmt: skip
         return flat
+
+
+def token_of(value: Any, where: str) -> bytes:
+    """A token: 1 to 64 bytes. InputError otherwise: SQLite columns may hold values of any type."""
+    if not isinstance(value, bytes) or not 0 < len(value) <= _MAX_TOKEN_BYTES:
+        got = f"{len(value)} bytes" if isinstance(value, bytes | str) else repr(value)[:40]
+        raise InputError("token is no short blob", where=where, expected=f"1 to {_MAX_TOKEN_BYTES} bytes",
+            got=f"{type(value).__name__}, {got}", remedy="is it a nuPlan log (v1.1)? copy the file again")  # fmt: skip
+    return value
+
+
+def text_of(value: Any, where: str) -> str:
+    """A name: a text of 1 to 200 bytes."""
+    if not isinstance(value, str) or not value:
+        raise InputError("name is no text", where=where, expected="a text", got=type(value).__name__ if value else repr(value))
+    return foreign_name(value, where)
+
+
+def _whole(value: Any, where: str) -> int:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if not isinstance(value, int):
+        raise InputError("value is no whole number", where=where, got=repr(value)[:40])
+    return value
 
 
 def _finite(value: Any, where: str) -> float:

@@ -18,6 +18,7 @@ middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offli
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,12 +33,21 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.clouds import read_cloud
-from mudg.data.importers.common import nearest_index, seconds, world_from_first
+from mudg.data.importers.common import (
+    has_pose,
+    mended_path,
+    nearest_index,
+    origin_note,
+    pose_near,
+    seconds,
+    world_from_first,
+)
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.data.importers.images import ImageFit, brown_conrady, fit_images, image_notes
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
 from mudg.data.importers.nuplan.database import NuplanCamera, NuplanCloud, NuplanLog, open_log
 from mudg.data.importers.options import ImportOptions
+from mudg.data.scene.returns import near_places
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
@@ -182,7 +192,15 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
     notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
     lidars = opened.lidars()
-    clouds = [opened.cloud(token, lidars, blobs) for token, _ in chosen]
+    placed = {token: opened.cloud(token, lidars, blobs) for token, _ in chosen}
+    clouds = [cloud for cloud in placed.values() if cloud is not None]
+    if len(clouds) < len(placed):
+        without = [token.hex() for token, cloud in placed.items() if cloud is None]
+        if not options.skip_missing:
+            raise InputError("point cloud has no vehicle pose", where=f"{where}: lidar_pc {without[0]}.ego_pose_token",
+                expected="a token of ego_pose", got=f"{len(without)} of {len(placed)} clouds have none",
+                remedy="choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        notes.append(f"{len(without)} clouds without a vehicle pose were left out")
     lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
     if lacking:
         _refuse_missing("point cloud", lacking, len(clouds), options)
@@ -219,7 +237,7 @@ def _moments(
     shots: Sequence[_Shot], names: Sequence[str], options: ImportOptions, where: str
 ) -> tuple[list[list[_Shot]], list[str]]:
     """The images of each moment at which all cameras fired, and notes; see ``_by_moment``."""
-    groups = _by_moment(shots, names)
+    groups = _by_moment(shots, names, where)
     missing = [shot.file for group in groups for shot in group if not shot.file.is_file()]
     _refuse_missing("camera image", missing, len(shots), options)
     complete = [{shot.channel for shot in group} == set(names) for group in groups]
@@ -237,13 +255,19 @@ def _moments(
     return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
 
-def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]]:
+def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list[list[_Shot]]:
     """Images put together by time, in order of time.
 
     Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the camera
     that has most of them, after its own camera's median delay is taken off. What lies half a period from all is alone.
     """
     by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
+    for name, found in by_camera.items():
+        for shot, following in itertools.pairwise(found):
+            if shot.time_us == following.time_us:
+                raise InputError("two images of one camera have the same time", where=f"{where}: image at {shot.time_us}",
+                    expected="a row for every image", got=f"{name}: {shot.file.name} and {following.file.name}",
+                    remedy="are rows of the table doubled? copy the file again")  # fmt: skip
     leading = max(by_camera.values(), key=len)
     if not leading:
         return []
@@ -269,7 +293,8 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str]) -> list[list[_Shot]
 
 def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
     start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
-    ego = _ego_path(plan, start_us, str(opened.path))
+    found: list[str] = []
+    ego = mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
     first = ego.pose_at(0.0)
     if first is None:
         raise InputError("vehicle poses do not cover the log", where=f"{opened.path}: ego_pose",
@@ -279,26 +304,31 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
     tracks, track_notes = _read_tracks(opened, plan, start_us, world_from_source)
-    notes = [*plan.notes, *image_notes(fits)]
+    notes = [*plan.notes, *found, *image_notes(fits), origin_note(first)]
     notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
+
+    def taken_s(shot: _Shot) -> float:
+        return (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
 
     def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
         index, what = item
         if isinstance(what, NuplanCloud):
             time_s, path = (what.time_us - start_us) / 1e6, what.file
             yield SceneSweep(
-                SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path), str(path)
+                SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path, what.places), str(path)
             )
             return
         for shot in what:
-            time_s = (shot.time_us + IMAGE_DELAY_US - start_us) / 1e6
-            world_from_ego = ego.pose_at(time_s)
-            if world_from_ego is None:
-                raise InputError("vehicle poses do not cover an image", where=str(shot.file), got=f"{time_s:.3f} s")
-            world_from_cam = world_from_ego @ plan.cameras[shot.channel].ego_from_cam
+            time_s = taken_s(shot)
+            world_from_cam = pose_near(ego, time_s, where=str(shot.file)) @ plan.cameras[shot.channel].ego_from_cam
             yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
 
-    items = [*enumerate(plan.clouds), *enumerate(plan.moments)]
+    moments = list(enumerate(plan.moments))
+    if options.skip_missing:
+        moments = [one for one in moments if all(has_pose(ego, taken_s(shot)) for shot in one[1])]
+        if len(moments) < len(plan.moments):
+            notes.append(f"{len(plan.moments) - len(moments)} moments without a vehicle pose were left out")
+    items = [*enumerate(plan.clouds), *moments]
     source = Source("nuplan", LICENCE, None, (*notes, *track_notes))
     return SceneContent(plan.name, source, fits, items, convert, _item_name, ego, tracks=lambda: (tracks, ()))
 
@@ -337,8 +367,11 @@ def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
     return fit_images(recorded, options, lens)
 
 
-def _read_points(path: Path) -> SweepPoints:
+def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:
+    """A merged cloud; zeros of the LiDARs that were merged lie at their ``places``, f64[3] each."""
     cloud = read_cloud(path)
-    intensity = cloud.fields.get("intensity")
-    grey = np.zeros(len(cloud.xyz)) if intensity is None else np.clip(intensity.astype(np.float64) / 255, 0, 1)
-    return SweepPoints(cloud.xyz.astype(np.float32), grey.astype(np.float32), np.zeros(len(cloud.xyz), np.float32))
+    intensity = cloud.fields.get("intensity", np.zeros(len(cloud.xyz)))
+    returns = ~near_places(cloud.xyz, places)
+    xyz, grey = cloud.xyz[returns].astype(np.float32), np.clip(intensity[returns].astype(np.float64) / 255, 0, 1)
+    no_returns = cloud.missing + int((~returns).sum())
+    return SweepPoints(xyz, grey.astype(np.float32), np.zeros(len(xyz), np.float32), no_returns=no_returns)

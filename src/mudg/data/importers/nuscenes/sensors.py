@@ -43,23 +43,24 @@ def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, wh
 def read_scan(path: Path) -> SweepPoints:
     """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
 
-    Returns of the recording vehicle are dropped; intensity becomes 0..1.
+    Returns of the recording vehicle are dropped, and beams without a return, which are counted; intensity becomes 0..1.
 
     Raises:
         InputError: cut off, not finite, or rings that no 32-beam sensor has.
     """
-    rows = read_float_rows(path, 5, "sweep")
-    rings = rows[:, 4]
-    if len(rows) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
+    rows, returns = read_float_rows(path, 5, "sweep")
+    rings = rows[returns, 4]
+    if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
         raise InputError("fifth value of the points is no ring number", where=str(path),
             expected=f"whole numbers 0 to {BEAMS - 1}", got=f"{rings.min():g} to {rings.max():g}",
             remedy="is this a file of another sensor or format?")  # fmt: skip
-    dt_s = point_times(rows[:, :3], rings)
+    dt_s = point_times(rows[:, :3], rows[:, 4])
     own = np.ones(len(rows), bool)
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
         own &= (rows[:, axis] > low) & (rows[:, axis] < high)
-    kept = rows[~own]
-    return SweepPoints(np.ascontiguousarray(kept[:, :3]), (kept[:, 3] / 255).clip(0, 1).astype(np.float32), dt_s[~own])
+    chosen = returns & ~own
+    xyz, intensity = np.ascontiguousarray(rows[chosen, :3]), (rows[chosen, 3] / 255).clip(0, 1).astype(np.float32)
+    return SweepPoints(xyz, intensity, dt_s[chosen], no_returns=int((~returns).sum()))
 
 
 def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray[np.float32]:

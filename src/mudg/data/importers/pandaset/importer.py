@@ -41,8 +41,15 @@ from mudg.base.geometry import from_rotation_translation, invert, transform_poin
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.data.importers import layout
 from mudg.data.importers.box_tracks import BoxTracks
-from mudg.data.importers.columns import finite_columns, record_fields, require_columns
-from mudg.data.importers.common import pose_from_quaternion, pose_near, seconds, world_from_first
+from mudg.data.importers.columns import finite_columns, record_fields, require_columns, returns_of
+from mudg.data.importers.common import (
+    mended_path,
+    origin_note,
+    pose_from_quaternion,
+    pose_near,
+    seconds,
+    world_from_first,
+)
 from mudg.data.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.data.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.data.importers.layout import LogFiles
@@ -136,11 +143,12 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
     clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
     frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
-    motion = _Motion.read(folder, frames, chosen)
+    notes: list[str] = []
+    motion = _Motion.read(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
     classes = PointClasses(folder / "annotations" / "semseg", frames, options)
-    notes = [
+    notes += [
         f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here",
         *image_notes(fits),
         *classes.notes,
@@ -158,12 +166,12 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
             time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
             yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
         cloud = _read_points(clouds[number], motion, index)
-        given = classes.of(number, len(cloud.xyz))
+        given = classes.of(number, len(cloud.returns))
+        given = None if given is None else given[cloud.returns]
         for d, sensor in SENSORS.items():
-            mine = cloud.d == d
-            if d == 0 or mine.any():
+            if d == 0 or (cloud.d == d).any():
                 pose = motion.world_from_lidar(d, cloud.time_s)
-                sweep = cloud.of_sensor(mine, invert(pose) @ motion.world_from_source, given)
+                sweep = cloud.of_sensor(d, invert(pose) @ motion.world_from_source, given)
                 yield SceneSweep(sensor, index, cloud.time_s, pose, sweep, str(clouds[number]))
         taken_s = [float(motion.camera_s[name][index]) for name in chosen]
         images_s[cloud.time_s] = min(taken_s), max(taken_s)
@@ -237,15 +245,20 @@ class _Motion:
     places: Mapping[int, Matrix]
 
     @classmethod
-    def read(cls, folder: Path, frames: Sequence[int], cameras: Sequence[str]) -> _Motion:
+    def read(
+        cls, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
+    ) -> _Motion:
         file = folder / "lidar" / "timestamps.json"
-        known = [*range(max(frames[0] - 1, 0), frames[0]), *frames]
+        known = range(max(frames[0] - 1, 0), frames[-1] + 1)  # those of frames that are left out tell where the vehicle was, too
+        first = frames[0] - known[0]
         raw_s = _times(file, known)
-        start_s = float(raw_s[len(known) - len(frames)])
+        start_s = float(raw_s[first])
         forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
-        world_from_source = world_from_first(forward[len(known) - len(frames)])
+        world_from_source = world_from_first(forward[first])
+        notes.append(origin_note(forward[first]))
         path = EgoPath(seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
-        raw_s = raw_s[-len(frames) :]
+        path = mended_path(path, options, notes)
+        raw_s = raw_s[[number - known[0] for number in frames]]
         needed = dict.fromkeys((*cameras, "front_camera"))
         camera_s, world_from_cam = {}, {}
         for name in needed:
@@ -358,26 +371,31 @@ def _columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cloud:
     """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of the scene's clock, the
-    middle of the turn), ``d`` 0 or 1."""
+    middle of the turn), ``d`` 0 or 1. Beams without a return are left out: ``returns`` bool[M] says which rows of the file are none, and
+    ``without`` how many of them each LiDAR has."""
 
     time_s: float
     xyz: Matrix
     intensity: NDArray[np.float64]
     dt_s: NDArray[np.float64]
     d: NDArray[np.float64]
+    returns: NDArray[np.bool_]
+    without: Mapping[int, int]
 
-    def of_sensor(
-        self, mine: NDArray[np.bool_], lidar_from_source: Matrix, classes: NDArray[np.uint8] | None
-    ) -> SweepPoints:
-        """The points that are ``mine`` in the frame of their LiDAR."""
+    def of_sensor(self, d: int, lidar_from_source: Matrix, classes: NDArray[np.uint8] | None) -> SweepPoints:
+        """The points of LiDAR ``d`` in its frame."""
+        mine = self.d == d
         xyz = transform_points(lidar_from_source, self.xyz[mine]).astype(np.float32)
         intensity, dt_s = (values[mine].astype(np.float32) for values in (self.intensity, self.dt_s))
-        return SweepPoints(xyz, intensity, dt_s, None if classes is None else classes[mine])
+        return SweepPoints(xyz, intensity, dt_s, None if classes is None else classes[mine], self.without[d])
 
 
 def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     frame_s = float(motion.raw_s[index])
     frame = _columns(path, _POINT_COLUMNS)
+    returns = returns_of(frame, path)
+    without = {d: int((frame["d"][~returns] == d).sum()) for d in SENSORS}
+    frame = {name: values[returns] for name, values in frame.items()}
     columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     late_s = columns["t"] - frame_s
     if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
@@ -391,7 +409,7 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
     xyz = np.stack([columns[axis] for axis in "xyz"], 1)
     intensity = (columns["i"] / 255).clip(0, 1)
-    return _Cloud(frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"])
+    return _Cloud(frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
 
 
 # --- boxes ------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,234 @@
+"""What keys of poses tell about a motion: gaps between them, headings that flip, jumps and turns that no vehicle makes.
+
+Poses between two keys lie on the straight line through both (``geometry.pose_at``). Where keys are missing, the path between was
+another: a cubic curve with the velocities on either side says how far off the line may be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.types import EgoPath
+
+Matrix = NDArray[np.float64]
+Times = NDArray[np.float64]
+
+VEHICLES: Final = frozenset(
+    ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
+     "bicycle")
+)  # fmt: skip
+"""Labels of what drives. These are longer than wide; barriers, signs and people need not be."""
+GAP_STEPS: Final = 2.5
+GAP_S: Final = 0.25
+"""A gap is a step of time above both: so many usual ones, and so many seconds."""
+GAP_M: Final = 3.0
+"""Over a gap in which the vehicle moved less than this, a straight line is near enough."""
+OFF_M: Final = 0.25
+LONG_GAP_S: Final = 1.0
+NEAR_KEY_S: Final = 0.15
+"""In a gap above ``LONG_GAP_S`` nothing is known of what lies farther than this from both of its keys."""
+BRIDGE_STEP_S: Final = 0.1
+FLIP_DEG: Final = 150.0
+MOST_TURN_RAD_S: Final = 2.0
+"""Vehicles turn slower than this."""
+MOST_WALKER_TURN_RAD_S: Final = 8.0
+MOST_JUMP_M_S2: Final = 30.0
+MOST_ACCELERATION_M_S2: Final = 20.0
+_ACCELERATION_OVER_S: Final = 0.2
+_VELOCITY_OVER_S: Final = 0.1
+_VELOCITY_WITHIN_S: Final = 1.0
+MIN_TURN_DEG: Final = 30.0
+"""Smaller turns between two keys may be noise."""
+_STEP_M: Final = 0.05
+_COURSE_M: Final = 1.0
+_ALONG: Final = 0.8
+_CLEAR_SHARE: Final = 1 / 3
+
+
+# --- gaps -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Keys that are missing after key ``key``: for how long, how far the vehicle moved meanwhile, and how far from a straight line, as
+    the velocities on either side have it, it may have been."""
+
+    key: int
+    start_s: float
+    end_s: float
+    moved_m: float
+    off_m: float
+
+    @property
+    def is_guess(self) -> bool:
+        """Whether poses in it would be guesses."""
+        return self.off_m > OFF_M or self.end_s - self.start_s > LONG_GAP_S
+
+    def __str__(self) -> str:
+        return (
+            f"no pose for {self.end_s - self.start_s:.2f} s after {self.start_s:.3f} s (key {self.key}), while it moved "
+            f"{self.moved_m:.1f} m; a straight line between may be {self.off_m:.2f} m off"
+        )
+
+
+def gaps(times_s: Times, poses: Matrix) -> list[Gap]:
+    """The gaps between pose keys f64[T], f64[T, 4, 4] in which something moved by ``GAP_M`` or more."""
+    steps = np.diff(times_s)
+    if not (steps > GAP_S).any():
+        return []
+    usual = float(np.sort(steps)[len(steps) // 10])  # not the median: of few keys a gap would be usual
+    long = np.flatnonzero(steps > max(GAP_S, GAP_STEPS * usual))
+    moved = np.linalg.norm(poses[long + 1, :3, 3] - poses[long, :3, 3], axis=1)
+    return [
+        Gap(key, float(times_s[key]), float(times_s[key + 1]), float(m), max(_off_m(times_s, poses, key, u) for u in (0.25, 0.5, 0.75)))
+        for key, m in zip(long.tolist(), moved, strict=True)
+        if m >= GAP_M
+    ]
+
+
+def gap_at(path: EgoPath, time_s: float) -> Gap | None:
+    """The gap in which a pose at ``time_s`` would be a guess: in a curve, or far from any key of a long gap; None elsewhere."""
+    after = int(np.searchsorted(path.times_s, time_s))
+    if after in (0, len(path.times_s)) or path.times_s[after] - path.times_s[after - 1] <= GAP_S:
+        return None
+    gap = next((one for one in gaps(path.times_s, path.world_from_ego) if one.key == after - 1), None)
+    if gap is None:
+        return None
+    share = (time_s - gap.start_s) / (gap.end_s - gap.start_s)
+    lost = gap.end_s - gap.start_s > LONG_GAP_S and min(time_s - gap.start_s, gap.end_s - time_s) > NEAR_KEY_S
+    return gap if lost or _off_m(path.times_s, path.world_from_ego, gap.key, share) > OFF_M else None
+
+
+def bridged(path: EgoPath) -> EgoPath:
+    """The path with keys every 0.1 s in its gaps, on cubic curves with the velocities on either side; turns as between keys."""
+    times, poses = [path.times_s], [path.world_from_ego]
+    for gap in gaps(path.times_s, path.world_from_ego):
+        inner = np.linspace(gap.start_s, gap.end_s, int((gap.end_s - gap.start_s) / BRIDGE_STEP_S) + 2)[1:-1]
+        made = np.stack([path.pose_at(float(time_s)) for time_s in inner])
+        for pose, time_s in zip(made, inner, strict=True):
+            share = float(time_s - gap.start_s) / (gap.end_s - gap.start_s)
+            pose[:3, 3] += _bulge(path.times_s, path.world_from_ego, gap.key, share)
+        times.append(inner)
+        poses.append(made)
+    order = np.argsort(np.concatenate(times), kind="stable")
+    return EgoPath(np.concatenate(times)[order], np.concatenate(poses)[order])
+
+
+def _off_m(times_s: Times, poses: Matrix, key: int, share: float) -> float:
+    return float(np.linalg.norm(_bulge(times_s, poses, key, share)))
+
+
+def _bulge(times_s: Times, poses: Matrix, key: int, share: float) -> Matrix:
+    """Cubic curve less straight line f64[3] at a part (0..1) of the way from a key to the next."""
+    span = float(times_s[key + 1] - times_s[key])
+    chord = (poses[key + 1, :3, 3] - poses[key, :3, 3]) / span
+    before, after = _velocity(times_s, poses, key, -1), _velocity(times_s, poses, key + 1, 1)
+    lead = np.zeros(3) if before is None else before - chord
+    trail = np.zeros(3) if after is None else after - chord
+    return span * (share * (1 - share) ** 2 * lead - share**2 * (1 - share) * trail)
+
+
+def _velocity(times_s: Times, poses: Matrix, key: int, way: int) -> Matrix | None:
+    """Velocity f64[3] at a key by the keys before (-1) or after (1) it, over a tenth of a second where they are that close."""
+    other = key + way
+    while 0 <= other + way < len(times_s) and abs(times_s[other] - times_s[key]) < _VELOCITY_OVER_S - 1e-9:
+        other += way
+    if not 0 <= other < len(times_s) or abs(times_s[other] - times_s[key]) > _VELOCITY_WITHIN_S:
+        return None
+    return (poses[other, :3, 3] - poses[key, :3, 3]) / (times_s[other] - times_s[key])
+
+
+# --- headings ---------------------------------------------------------------------------------------------------------
+
+
+def turns(times_s: Times, poses: Matrix) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angle between the x axes of neighbouring keys in radians, and per second: f64[T - 1] each."""
+    forward = poses[:, :3, 0]
+    angle = np.arccos(np.clip(np.einsum("ni,ni->n", forward[:-1], forward[1:]), -1, 1))
+    return angle, angle / np.diff(times_s)
+
+
+def most_turn_rad_s(label: str) -> float:
+    """The fastest turn of something with this label."""
+    return MOST_TURN_RAD_S if label in VEHICLES else MOST_WALKER_TURN_RAD_S
+
+
+def heading_flips(times_s: Times, poses: Matrix, most_rad_s: float) -> NDArray[np.intp]:
+    """Keys after which the heading is turned by about 180 degrees at once, faster than ``most_rad_s``; what lies down does not count."""
+    angle, rate = turns(times_s, poses)
+    upright = np.einsum("ni,ni->n", poses[:-1, :3, 2], poses[1:, :3, 2]) > 0.5
+    return np.flatnonzero((angle > np.deg2rad(FLIP_DEG)) & (rate > most_rad_s) & upright)
+
+
+def unflipped(times_s: Times, poses: Matrix, most_rad_s: float) -> tuple[Matrix, NDArray[np.intp]]:
+    """Poses with flipped headings turned back, and the keys that were.
+
+    Headings agree but for their sign. The sign of the rarer third or less is wrong; where it is more, the direction of travel
+    decides; where nothing moves either, nothing is changed.
+    """
+    flips = heading_flips(times_s, poses, most_rad_s)
+    if not len(flips):
+        return poses, flips
+    side = np.ones(len(poses))
+    for key in flips:
+        side[key + 1 :] *= -1
+    rarer = min(int((side > 0).sum()), int((side < 0).sum())) / len(side)
+    if rarer <= _CLEAR_SHARE:
+        right = np.sign(side.sum())
+    else:
+        steps = np.diff(poses[:, :3, 3], axis=0)
+        length = np.linalg.norm(steps, axis=1)
+        moving = length > _STEP_M
+        along = float((np.einsum("ni,ni->n", poses[:-1, :3, 0], steps) * side[:-1])[moving].sum())
+        if length[moving].sum() < _COURSE_M or abs(along) < _ALONG * length[moving].sum():
+            return poses, np.zeros(0, np.intp)
+        right = np.sign(along)
+    turned = np.flatnonzero(side != right)
+    poses = poses.copy()
+    poses[turned, :3, :2] *= -1
+    return poses, turned
+
+
+# --- jumps ------------------------------------------------------------------------------------------------------------
+
+
+def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, float, float]]:
+    """Steps between keys that the motion before and after does not explain.
+
+    A step is compared with the median velocity of up to two steps on either side: what is left over is the jump.
+
+    Returns:
+        Key after which it is, metres, and metres per second squared, the largest first; those of ``least_m`` and
+        ``MOST_JUMP_M_S2`` on.
+    """
+    steps_s = np.diff(times_s)
+    if len(steps_s) < 3:
+        return []
+    velocity = np.diff(poses[:, :3, 3], axis=0) / steps_s[:, None]
+    found = []
+    for key in range(len(steps_s)):
+        near = [n for n in range(max(0, key - 2), min(len(steps_s), key + 3)) if n != key]
+        off = float(np.linalg.norm(velocity[key] - np.median(velocity[near], axis=0))) * float(steps_s[key])
+        if off >= least_m and off / steps_s[key] ** 2 >= MOST_JUMP_M_S2:
+            found.append((key, off, off / float(steps_s[key]) ** 2))
+    return sorted(found, key=lambda jump: -jump[1])
+
+
+def largest_acceleration(times_s: Times, poses: Matrix) -> tuple[int, float]:
+    """The key at which the velocity changes fastest, and by how much, m/s^2: of the velocities over a fifth of a second on either side."""
+    best = 0, 0.0
+    for key in range(1, len(times_s) - 1):
+        before = int(np.searchsorted(times_s, times_s[key] - _ACCELERATION_OVER_S + 1e-9, side="right")) - 1
+        after = int(np.searchsorted(times_s, times_s[key] + _ACCELERATION_OVER_S - 1e-9))
+        if before < 0 or after >= len(times_s):
+            continue
+        lead, trail = (
+            (poses[b, :3, 3] - poses[a, :3, 3]) / (times_s[b] - times_s[a]) for a, b in ((before, key), (key, after))
+        )
+        change = float(np.linalg.norm(trail - lead)) * 2 / float(times_s[after] - times_s[before])
+        best = max(best, (key, change), key=lambda one: one[1])
+    return best
