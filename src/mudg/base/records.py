@@ -51,6 +51,23 @@ class StrictRecord(BaseModel):
         return value
 
 
+class ForeignRecord(StrictRecord):
+    """A JSON object of a format that belongs to others: types are not converted; fields that it does not know are passed over."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="allow")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_fields(cls, value: Any) -> Any:
+        return value
+
+    def unknown(self, prefix: str = "") -> list[str]:
+        """Names of the fields that were passed over, those of records within as ``record.field``."""
+        own = [prefix + name for name in self.model_extra or ()]
+        inner = {name: getattr(self, name) for name in type(self).model_fields}
+        return own + [n for name, one in inner.items() if isinstance(one, ForeignRecord) for n in one.unknown(f"{prefix}{name}.")]
+
+
 @functools.cache
 def _field_names(record: type[BaseModel]) -> dict[str, None]:
     return {field.alias or name: None for name, field in record.model_fields.items()}

@@ -6,7 +6,7 @@ import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -83,6 +83,17 @@ class GzipStream:
         if len(found) < size:
             raise InputError(f"the file ends within {what}", where=self._where, expected=f"{size} bytes", got=f"{len(found)} bytes",
                 remedy="it was cut off, or its header is damaged: get the file again")  # fmt: skip
+        return bytes(found)
+
+    def rest(self, most: int) -> bytes:
+        """What is left, up to ``most`` bytes."""
+        found = bytearray()
+        try:
+            while len(found) < most and (more := self._inflater.decompress(self._rest, most - len(found))):
+                self._rest = self._inflater.unconsumed_tail
+                found += more
+        except zlib.error as error:
+            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
         return bytes(found)
 
     def close(self) -> None:
@@ -172,6 +183,12 @@ class BoundedZip:
             raise InputError("a file in the zip has another size than listed", where=where, expected=str(info.file_size),
                 got=str(len(content)))  # fmt: skip
         return content
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names of a foreign file for a message: the first twelve, 40 printable characters each."""
+    every = ["".join(c if c.isprintable() else "?" for c in str(name))[:40] for name in names]
+    return ", ".join(every[:12]) + (f" and {len(every) - 12} more" if len(every) > 12 else "")
 
 
 # -- order and packing ---------------------------------------------------------------------------------------------------

@@ -31,17 +31,19 @@ class SplatCloud:
     """Gaussians of one frame.
 
     Args:
-        means: f32[n, 3] metres. quats: f32[n, 4] (w, x, y, z) of length 1. log_scales: f32[n, 3], natural logarithm of metres.
-        logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1, 4, 9 or 16 harmonics of the directions of the same frame.
-        class_ids: u8[n] train ids (255 = unknown), or None.
+        means: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away. quats: f32[n, 4] (w, x, y, z) of length 1.
+        log_scales: f32[n, 3], natural logarithm of metres. logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1, 4, 9 or 16 harmonics
+            of the directions of the same frame.
+        class_ids: u8[n] train ids (255 = unknown), or None. antialias: they are to be drawn antialiased, as they were fitted.
     """
 
-    means: Floats
+    means: Floats | Matrix
     quats: Floats
     log_scales: Floats
     logits: Floats
     sh: Floats
     class_ids: NDArray[np.uint8] | None = None
+    antialias: bool = False
 
     def __len__(self) -> int:
         return len(self.means)
@@ -59,9 +61,8 @@ class SplatCloud:
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> SplatCloud:
         """Some rows, in the order given."""
         classes = None if self.class_ids is None else self.class_ids[rows]
-        return SplatCloud(
-            self.means[rows], self.quats[rows], self.log_scales[rows], self.logits[rows], self.sh[rows], classes
-        )
+        columns = (self.means[rows], self.quats[rows], self.log_scales[rows], self.logits[rows], self.sh[rows])
+        return SplatCloud(*columns, classes, self.antialias)
 
     def moved(self, a_from_b: Matrix) -> SplatCloud:
         """The same Gaussians in another frame: places, rotations and harmonics; ``a_from_b`` rigid f64[4, 4]."""
@@ -70,6 +71,13 @@ class SplatCloud:
         return replace(
             self, means=geometry.transform_points(a_from_b, self.means), quats=turned(turn, self.quats), sh=sh
         )
+
+    def mirrored(self) -> SplatCloud:
+        """The same Gaussians with y turned round: from left-handed axes to right-handed ones."""
+        flip = np.array([1.0, -1.0, 1.0])
+        quats = self.quats * np.array([1, -1, 1, -1], np.float32)  # an axis of rotation changes its sign once more than a place
+        sh = self.sh if self.degree == 0 else harmonics.rotated(self.sh, np.diag(flip))
+        return replace(self, means=(self.means * flip).astype(self.means.dtype), quats=quats, sh=sh)
 
     def of_degree(self, degree: int) -> SplatCloud:
         """The same with harmonics of this degree: what is missing is zero, what is beyond is dropped."""
@@ -92,8 +100,27 @@ def joined(clouds: Sequence[SplatCloud]) -> SplatCloud:
     if any(cloud.class_ids is not None for cloud in parts):
         unknown = [np.full(len(c), 255, np.uint8) if c.class_ids is None else c.class_ids for c in parts]
         classes = np.concatenate(unknown)
-    columns = ("means", "quats", "log_scales", "logits", "sh")
-    return SplatCloud(*(np.concatenate([getattr(cloud, name) for cloud in parts]) for name in columns), classes)
+    columns = [np.concatenate([getattr(c, name) for c in parts]) for name in ("means", "quats", "log_scales", "logits", "sh")]
+    return SplatCloud(*columns, classes, any(cloud.antialias for cloud in parts))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplatFile:
+    """What the reader of a format finds in a file.
+
+    Args:
+        cloud: Gaussians in the axes of the file, ``means`` f64.
+        axes: where x, y and z of the file point, a letter each (``axes.py``), as the file states them; empty: it does not.
+        axes_by: what states them. step_m: distance of neighbouring numbers in which most places are stored; 0 = not worth a word.
+        notes: what a person may want to know. warnings: what may have come in otherwise than its program meant it.
+    """
+
+    cloud: SplatCloud
+    axes: str = ""
+    axes_by: str = ""
+    step_m: float = 0.0
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,8 +231,8 @@ def unit(quats: NDArray[np.floating], where: str) -> Floats:
     bad = ~(np.isfinite(length[:, 0]) & (length[:, 0] > 1e-12))
     if bad.any():
         row = int(bad.argmax())
-        raise InputError("a rotation is no quaternion", where=f"{where}: Gaussian {row}", got=str(q[row].tolist()),
-            expected="four finite numbers, not all 0")  # fmt: skip
+        raise InputError("a rotation is no quaternion", where=f"{where}: Gaussian {row}", expected="four finite numbers, not all 0",
+            got=f"{q[row].tolist()}; {int(bad.sum())} of {len(q)} are damaged", remedy="take them out, or write 1, 0, 0, 0")  # fmt: skip
     return (q / length).astype(np.float32)
 
 
@@ -228,7 +255,8 @@ def checked(cloud: SplatCloud, where: str) -> SplatCloud:
         if bad.any():
             row = int(bad.argmax())
             raise InputError(f"the {name} of a Gaussian is not finite", where=f"{where}: Gaussian {row}",
-                got=str(values[row].tolist()[:4]), remedy=f"{int(bad.sum())} of {len(cloud)} are damaged")  # fmt: skip
+                got=f"{values[row].tolist()[:4]}; {int(bad.sum())} of {len(cloud)} are damaged",
+                remedy="take them out, for example with splat-transform --filter-nan")  # fmt: skip
     far = (np.abs(cloud.means) > LARGEST_M).any(1) | (cloud.log_scales > MOST_LOG).any(1)
     if far.any():
         row = int(far.argmax())
@@ -236,3 +264,37 @@ def checked(cloud: SplatCloud, where: str) -> SplatCloud:
             expected=f"positions within {LARGEST_M:g} m, logarithms of sizes below {MOST_LOG:g}",
             got=f"{cloud.means[row].tolist()}, {cloud.log_scales[row].tolist()}")  # fmt: skip
     return replace(cloud, quats=unit(cloud.quats, where), log_scales=cloud.log_scales.clip(LEAST_LOG))
+
+
+def spacing_m(places: NDArray[np.floating], kind: type[np.floating] = np.float32) -> float:
+    """Distance of neighbouring numbers of a kind, at the farthest places [n, 3] but for a tenth: outliers are far anyway."""
+    return float(np.spacing(kind(np.quantile(np.abs(places).max(1), 0.9))))
+
+
+def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
+    """Sentences on values that a format stores as logarithms and logits, and that look as if they had not been taken.
+
+    Raises:
+        InputError: neither sizes nor opacities can be what the format says.
+    """
+    plain_opacity = bool((cloud.logits >= 0).all() and (cloud.logits <= 1).all() and (cloud.logits > 0).any())
+    plain_size = bool((cloud.log_scales[:, :2] > 0).all())  # the third is that of flat Gaussians
+    if plain_opacity and plain_size:
+        raise InputError("sizes and opacities are plain values, where files of Gaussians hold logarithms and logits", where=where,
+            expected="negative numbers for sizes below 1 m and opacities below 0.5",
+            got=f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to {cloud.logits.max():.3g}",
+            remedy="write log(scale) and log(opacity / (1 - opacity)) into the file")  # fmt: skip
+    found = []
+    if plain_opacity:
+        found.append("all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due: if it looks "
+                     "like fog, write log(opacity / (1 - opacity)) into the file")  # fmt: skip
+    if plain_size:
+        found.append("all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due: if it looks like "
+                     "fog, write log(scale) into the file")  # fmt: skip
+    if len(cloud) and (cloud.logits >= 0).all() and cloud.logits.max() > 2 * MOST_LOGIT:
+        found.append(f"opacities reach {cloud.logits.max():.4g}, as if values from 0 to 255 had been stored where logits are due: all "
+                     "Gaussians count as solid")  # fmt: skip
+    if len(cloud) and np.median(np.abs(cloud.sh[:, 0])) > 8:
+        found.append("colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc: write "
+                     "(colour / 255 - 0.5) / 0.2821 into the file")  # fmt: skip
+    return found

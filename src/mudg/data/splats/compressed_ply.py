@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError
 from mudg.core.sh import C0
 from mudg.data.splats import binary, ply
-from mudg.data.splats.cloud import SplatCloud, checked, logit
+from mudg.data.splats.cloud import SplatCloud, SplatFile, checked, logit, spacing_m
 
 CHUNK: Final = 256
 _BOUNDS: Final = tuple(
@@ -32,8 +32,8 @@ _LOG_RANGE: Final = 20.0
 Array = NDArray[np.float64]
 
 
-def to_bytes(cloud: SplatCloud) -> bytes:
-    """A cloud as a compressed PLY file; rows are brought into Morton order."""
+def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
+    """A cloud as a compressed PLY file; rows are brought into Morton order. ``antialias``: it is to be drawn so."""
     cloud = cloud.take(binary.morton_order(cloud.means))
     chunks = -(-len(cloud) // CHUNK)
     of_chunk = np.arange(len(cloud)) // CHUNK
@@ -64,7 +64,7 @@ def to_bytes(cloud: SplatCloud) -> bytes:
         rest = ply.channel_major(cloud.sh)
         elements.append(("sh", len(cloud), [("uchar", f"f_rest_{index}") for index in range(rest.shape[1])]))
         tables.append(np.trunc((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes())
-    return ply.header(elements) + b"".join(tables)
+    return ply.header(elements, antialias) + b"".join(tables)
 
 
 def is_compressed(content: bytes) -> bool:
@@ -72,50 +72,58 @@ def is_compressed(content: bytes) -> bool:
     return b"element chunk" in content[: content.find(b"end_header", 0, ply.MAX_HEADER) + 1]
 
 
-def from_bytes(content: bytes, where: str) -> SplatCloud:
-    """The Gaussians of a compressed PLY file.
+def from_bytes(content: bytes, where: str) -> SplatFile:
+    """The Gaussians of a compressed PLY file; columns and elements that it does not know are passed over.
 
     Raises:
         InputError: another kind of PLY, or a damaged one.
     """
-    tables = ply.read_elements(content, where)
-    chunk, vertex = tables.get("chunk"), tables.get("vertex")
+    file = ply.read_elements(content, where, ("chunk", "vertex", "sh"))
+    chunk, vertex = file.tables.get("chunk"), file.tables.get("vertex")
     if chunk is None or vertex is None or any(name not in (vertex.dtype.names or ()) for name in _PACKED):
         raise InputError(
             "not a compressed PLY of Gaussians",
             where=where,
             expected="elements chunk and vertex with " + ", ".join(_PACKED),
         )
+    if any(vertex.dtype[name].kind not in "iu" or vertex.dtype[name].itemsize != 4 for name in _PACKED):
+        raise InputError(
+            "the packed columns of a compressed PLY are no words", where=where, expected="uint", got=str(vertex.dtype)[:200]
+        )
+    words = {name: vertex[name].astype("<u4") for name in _PACKED}
     names = chunk.dtype.names or ()
     if len(chunk) != -(-len(vertex) // CHUNK) or any(name not in names for name in _BOUNDS[:12]):
         raise InputError("the chunks of the compressed PLY do not fit its vertices", where=where,
-            expected=f"{-(-len(vertex) // CHUNK)} chunks", got=f"{len(chunk)}: {', '.join(names[:4])}, ...")  # fmt: skip
+            expected=f"{-(-len(vertex) // CHUNK)} chunks", got=f"{len(chunk)}: {binary.listed(names[:4])}, ...")  # fmt: skip
     of_chunk = np.arange(len(vertex)) // CHUNK
-    means = _between(_unpack_11_10_11(vertex["packed_position"]), ply.columns_of(chunk, _BOUNDS[:6])[of_chunk])
-    scales = _between(_unpack_11_10_11(vertex["packed_scale"]), ply.columns_of(chunk, _BOUNDS[6:12])[of_chunk])
-    rgba = np.stack([vertex["packed_color"] >> shift & 255 for shift in (24, 16, 8, 0)], 1) / 255
+    bounds = {name: chunk[name].astype(np.float64) for name in _BOUNDS if name in names}
+    low, high = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3))
+    means = _between(_unpack_11_10_11(words["packed_position"]), low, high, of_chunk)
+    low_size, high_size = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (6, 9))
+    scales = _between(_unpack_11_10_11(words["packed_scale"]), low_size, high_size, of_chunk)
+    rgba = np.stack([words["packed_color"] >> shift & 255 for shift in (24, 16, 8, 0)], 1) / 255
     color = rgba[:, :3]  # files of the first version state no bounds of colours
     if all(name in names for name in _BOUNDS[12:]):
-        color = _between(color, ply.columns_of(chunk, _BOUNDS[12:])[of_chunk])
-    word = vertex["packed_rotation"]
+        dark, bright = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (12, 15))
+        color = _between(color, dark, bright, of_chunk)
+    word = words["packed_rotation"]
     three = (np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1) / 1023 - 0.5) * np.sqrt(2)
     quats = binary.from_smallest_three(word >> 30, three)
-    sh = np.concatenate([((color - 0.5) / C0)[:, None], _rest(tables.get("sh"), len(vertex), where)], 1)
-    columns = [values.astype(np.float32) for values in (means, quats, scales)]
-    return checked(SplatCloud(*columns, logit(rgba[:, 3]), sh.astype(np.float32)), where)
+    sh = np.concatenate([((color - 0.5) / C0)[:, None], _rest(file.tables.get("sh"), len(vertex), where)], 1)
+    columns = [values.astype(np.float32) for values in (quats, scales)]
+    cloud = checked(SplatCloud(means, *columns, logit(rgba[:, 3]), sh.astype(np.float32), None, file.antialias), where)
+    step = spacing_m(np.concatenate([low, high])) if chunk.dtype["min_x"].itemsize == 4 else 0.0
+    return SplatFile(cloud, file.axes, file.axes_by, step, file.notes, file.warnings)
 
 
 def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
     if table is None:
         return np.zeros((count, 0, 3))
     names = table.dtype.names or ()
-    rest = tuple(f"f_rest_{index}" for index in range(len(names)))
-    if len(table) != count or len(names) not in _REST or any(table.dtype[name] != np.uint8 for name in names):
+    rest = tuple(f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in names)))
+    if len(table) != count or len(rest) not in _REST or any(name not in names or table.dtype[name] != np.uint8 for name in rest):
         raise InputError("the harmonics of the compressed PLY do not fit its vertices", where=where,
-            expected=f"{count} rows of 9, 24 or 45 uchar", got=f"{len(table)} rows of {len(names)}")  # fmt: skip
-    unknown = sorted(set(names) - set(rest))
-    if unknown:
-        raise InputError("the harmonics of the compressed PLY have unknown names", where=where, got=", ".join(unknown[:4]))
+            expected=f"{count} rows of 9, 24 or 45 uchar", got=f"{len(table)} rows of {binary.listed(names)}")  # fmt: skip
     raw = ply.columns_of(table, rest)
     values = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
     return ply.coefficient_major(((values - 0.5) * 8).astype(np.float32)).astype(np.float64)
@@ -134,8 +142,7 @@ def _unpack_11_10_11(words: NDArray[np.uint32]) -> Array:
     return np.stack([(words >> 21) / 2047, (words >> 11 & 1023) / 1023, (words & 2047) / 2047], 1)
 
 
-def _between(shares: Array, bounds: NDArray[np.float32]) -> Array:
-    """Values at shares [n, 3] of the way from the lower to the upper bounds f32[n, 6]."""
-    low, high = bounds[:, :3].astype(np.float64), bounds[:, 3:].astype(np.float64)
+def _between(shares: Array, low: Array, high: Array, of_chunk: NDArray[np.intp]) -> Array:
+    """Values at shares [n, 3] of the way from the lower to the upper bounds [chunks, 3]."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return low + shares * (high - low)
+        return low[of_chunk] + shares * (high - low)[of_chunk]

@@ -5,27 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePath
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import geometry
+from mudg.base import geometry, log
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
 from mudg.core.ground import HeightMap
-from mudg.data.splats import alpasim, bundle, compressed_ply, gltf, gltf_read, ply, sog, splat, spz, usd
-from mudg.data.splats.cloud import SplatCloud, SplatNode, SplatScene
-
-Axes = Literal["viewer", "world"]
-
-_SIDES: Final[Mapping[str, NDArray[np.float64]]] = {
-    "right, down, forward": np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], np.float64),
-    "right, up, back": np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], np.float64),
-    "y up": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64),
-    "z up": np.eye(3),
-}
-"""What x, y, z of a file are called: rotation from the axes of this program (x forward, y left, z up)."""
+from mudg.data.splats import alpasim, axes, bundle, compressed_ply, gltf, gltf_read, ply, sog, splat, spz, usd
+from mudg.data.splats.cloud import SplatCloud, SplatFile, SplatNode, SplatScene, doubtful_values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +54,7 @@ class SplatFormat:
     """One format.
 
     Args:
-        suffixes: of its files, the usual one first. axes: of ``_SIDES``, what its readers expect. write: bytes of a request, or None:
+        suffixes: of its files, the usual one first. axes: of ``axes.py``, what its readers expect. write: bytes of a request, or None:
             written elsewhere. read: Gaussians of bytes, or None: not read.
         carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``.
     """
@@ -72,36 +62,49 @@ class SplatFormat:
     suffixes: tuple[str, ...]
     axes: str
     write: Callable[[WriteRequest], bytes]
-    read: Callable[[bytes, str], SplatCloud] | None = None
+    read: Callable[[bytes, str], SplatFile] | None = None
     carries: frozenset[str] = field(default_factory=lambda: frozenset({"harmonics"}))
 
 
 FORMATS: Final[Mapping[str, SplatFormat]] = {
-    "ply": SplatFormat((".ply",), "right, down, forward", lambda r: ply.to_bytes(r.cloud, classes=True), ply.from_bytes,
-                       frozenset({"harmonics", "classes"})),
-    "bundle": SplatFormat((".zip",), "z up", lambda r: bundle.to_bytes(r.scene, r.log), None,
+    "ply": SplatFormat((".ply",), "RDF", lambda r: ply.to_bytes(r.cloud, classes=True, antialias=r.antialias),
+                       ply.from_bytes, frozenset({"harmonics", "classes", "antialias"})),
+    "bundle": SplatFormat((".zip",), axes.WORLD, lambda r: bundle.to_bytes(r.scene, r.log), None,
                           frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "spz": SplatFormat((".spz",), "right, up, back", lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
+    "spz": SplatFormat((".spz",), "RUB", lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
                        spz.from_bytes, frozenset({"harmonics", "antialias"})),
-    "glb": SplatFormat((".glb",), "y up", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf_read.from_bytes,
-                       frozenset({"harmonics", "motion"})),
-    "usda": SplatFormat((".usda", ".usd"), "z up", lambda r: usd.to_text(r.scene, r.time_s, log=r.log), None,
+    "glb": SplatFormat((".glb",), "FUR", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf_read.from_bytes,
+                       frozenset({"harmonics", "motion", "antialias"})),
+    "usda": SplatFormat((".usda", ".usd"), axes.WORLD, lambda r: usd.to_text(r.scene, r.time_s, log=r.log), None,
                         frozenset({"harmonics", "motion", "deformation", "classes"})),
-    "usdz": SplatFormat((".usdz",), "z up", lambda r: usd.to_package(r.scene, r.time_s, r.log), None,
+    "usdz": SplatFormat((".usdz",), axes.WORLD, lambda r: usd.to_package(r.scene, r.time_s, r.log), None,
                         frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "alpasim": SplatFormat((".usdz",), "z up", lambda r: alpasim.to_package(r.scene, r.log, r.ground), None,
+    "alpasim": SplatFormat((".usdz",), axes.WORLD, lambda r: alpasim.to_package(r.scene, r.log, r.ground), None,
                            frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "right, down, forward", lambda r: compressed_ply.to_bytes(r.cloud),
-                                  compressed_ply.from_bytes),
-    "sog": SplatFormat((".sog",), "right, down, forward", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
+    "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "RDF", lambda r: compressed_ply.to_bytes(r.cloud, r.antialias),
+                                  compressed_ply.from_bytes, frozenset({"harmonics", "antialias"})),
+    "sog": SplatFormat((".sog",), "RDF", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
                        frozenset({"harmonics", "antialias"})),
-    "splat": SplatFormat((".splat",), "right, down, forward", lambda r: splat.to_bytes(r.cloud), splat.from_bytes, frozenset()),
+    "splat": SplatFormat((".splat",), "RDF", lambda r: splat.to_bytes(r.cloud), splat.from_bytes, frozenset()),
 }  # fmt: skip
 
 
-def file_from_world(name: str, axes: Axes) -> NDArray[np.float64]:
-    """From the axes of this program to those of a format, f64[4, 4]; ``world``: no change."""
-    turn = np.eye(3) if axes == "world" else _SIDES[FORMATS[name].axes]
+COARSE_M: Final = 1e-3
+"""Steps between places beyond this are worth a word."""
+_OF_TRAINING: Final = "export PLY from the program that trained the Gaussians"
+_UNREAD: Final[Mapping[str, str]] = {
+    ".ksplat": "convert it, for example with splat-transform in.ksplat out.ply", ".lcc": "convert it, for example with splat-transform",
+    ".json": "give the .sog file that holds meta.json and its pictures (splat-transform meta.json out.sog)",
+    ".gltf": "pack it with its buffers into a .glb file",
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "export it again as ply, spz or glb"),
+    ".ckpt": _OF_TRAINING, ".pt": _OF_TRAINING, ".pth": _OF_TRAINING, ".npz": _OF_TRAINING,
+}  # fmt: skip
+"""What to do with files of Gaussians, or that come with them, that are not read."""
+
+
+def file_from_world(name: str, choice: str) -> NDArray[np.float64]:
+    """From the axes of this program to those of a format (``viewer``), f64[4, 4]; ``world``: no change."""
+    turn = axes.world_from_axes(axes.WORLD if choice == "world" else FORMATS[name].axes).T
     return geometry.from_rotation_translation(turn, (0.0, 0.0, 0.0))
 
 
@@ -116,6 +119,8 @@ def format_of(content: bytes, name: str) -> str:
         return "compressed-ply" if compressed_ply.is_compressed(content) else "ply"
     for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"glTF", "glb"), (b"PK\x03\x04", "sog")):
         if content.startswith(mark):
+            if suffix == ".usdz":
+                break
             return found
     if suffix == ".splat":
         return "splat"
@@ -125,15 +130,17 @@ def format_of(content: bytes, name: str) -> str:
         where=name,
         expected=known,
         got=f"it begins with {content[:8]!r}",
+        remedy=_UNREAD.get(suffix, ""),
     )
 
 
-def read_cloud(content: bytes, name: str, axes: Axes = "viewer") -> tuple[SplatCloud, str]:
-    """The Gaussians of a file in the axes of this program (z up), and the name of its format.
+def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCloud, str]:
+    """The Gaussians of a file in the axes of this program (z up), and the name of its format; ``means`` f64: take an origin near them away
+    before they become f32. Says on stderr what the file holds that was passed over or taken with doubt.
 
     Args:
-        name: of the file, for messages and for formats without a mark. axes: ``viewer``: the file has the axes that viewers of its format
-            expect; ``world``: those of this program.
+        name: of the file, for messages and for formats without a mark. choice: of axes. ``file``: what the file says, else those that
+            viewers of its format expect; ``viewer``: these; ``world``: those of this program; or letters of ``axes.py``.
 
     Raises:
         InputError: another or a damaged file. ResourceError: a package that this file needs is not installed.
@@ -143,8 +150,29 @@ def read_cloud(content: bytes, name: str, axes: Axes = "viewer") -> tuple[SplatC
     if read is None:  # no mark leads here
         raise InputError("files of this format are not read", where=name, got=found)
     with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
-        cloud = read(content, name)
-    return cloud.moved(geometry.invert(file_from_world(found, axes))), found
+        file = read(content, name)
+        doubts = doubtful_values(file.cloud, name)
+    usual = {"viewer": FORMATS[found].axes, "world": axes.WORLD, "file": file.axes or FORMATS[found].axes}
+    chosen = usual.get(choice, choice)
+    for note in file.notes:
+        log.info(f"{name}: {note}")
+    for warning in (*file.warnings, *doubts):
+        log.warn(f"{name}: {warning}")
+    if file.axes and file.axes != chosen:
+        log.warn(f"{name}: {file.axes_by} says {axes.in_words(file.axes)}; --axes {choice} reads it as {axes.in_words(chosen)}")
+    elif choice == "file" and file.axes and file.axes != FORMATS[found].axes:
+        log.info(f"{name}: read as {axes.in_words(chosen)}, as {file.axes_by} says; --axes viewer reads it as viewers of its format do")
+    if file.step_m > COARSE_M:
+        log.warn(f"{name}: its places are stored in steps of {file.step_m * 1000:.3g} mm: take an offset away before the file is written")
+    return in_world(file.cloud, chosen), found
+
+
+def in_world(cloud: SplatCloud, letters: str) -> SplatCloud:
+    """A cloud from other axes in those of this program."""
+    turn = axes.world_from_axes(letters)
+    if np.linalg.det(turn) < 0:
+        cloud, turn = cloud.mirrored(), turn @ np.diag([1.0, -1.0, 1.0])
+    return cloud.moved(geometry.from_rotation_translation(turn, (0.0, 0.0, 0.0)))
 
 
 def losses(name: str, request: WriteRequest) -> list[str]:

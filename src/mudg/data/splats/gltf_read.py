@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,34 +14,57 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError
 from mudg.core.sh import C0
 from mudg.data.splats import binary
-from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, checked, joined, logit, unit
+from mudg.data.splats.axes import in_words
+from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, SplatFile, checked, joined, logit, spacing_m, unit
 from mudg.data.splats.gltf import BIN_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, PREFIX
 
 _KINDS: Final = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_materials_unlit")
+"""Extensions without which a file can be read, or that are read."""
+_LINEAR: Final = {
+    "srgb_rec709_display": False, "lin_rec709_display": True, "BT.709-sRGB": False, "BT.709-linear": True,
+}  # fmt: skip
+"""Colour spaces and whether they are linear; the last two are names of the drafts."""
+_KIND: Final = ("kernel", "colorSpace", "projection", "sortingMethod", "extensions", "extras")
+_ROUNDING: Final = 1e-3
 _MOST_JSON: Final = 64 << 20
 _DEPTH: Final = 32
 
 Array = NDArray[np.float64]
 
 
-def from_bytes(content: bytes, where: str) -> SplatCloud:
+def from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of a GLB file, all meshes where the scene's nodes put them (without its animations), in the axes of the file.
+
+    Fields that it does not know are passed over, unless the file says that they are required.
 
     Raises:
         InputError: no GLB file, one without Gaussians, or a damaged one.
     """
     file = _GlbFile(content, where)
-    clouds = []
+    clouds, triangles = [], 0
     for matrix, mesh in file.placed():
         for primitive in file.entries(mesh, "primitives"):
             extensions = primitive.get("extensions")
             if isinstance(extensions, dict) and EXTENSION in extensions:
                 clouds.append(_moved(file.cloud(primitive, extensions[EXTENSION]), matrix, where))
+            else:
+                triangles += 1
     if not clouds:
         raise InputError("the GLB file holds no Gaussians", where=where, expected=f"meshes with {EXTENSION}",
             remedy="triangles and points cannot be imported")  # fmt: skip
-    return joined(clouds)
+    if triangles:
+        file.warnings[f"{triangles} meshes without Gaussians were passed over"] = None
+    if file.entries(file.document, "animations"):
+        file.warnings["its animations are not read: everything is where the nodes put it at rest"] = None
+    if file.passed:
+        file.notes[f"fields and extensions passed over: {binary.listed(sorted(file.passed))}"] = None
+    axes = "RDF" if file.of_old_transform(2) else ""
+    if axes:
+        file.warnings[f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF"] = None
+    cloud = replace(joined(clouds), antialias=file.antialias)
+    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, tuple(file.notes), tuple(file.warnings))
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -48,13 +73,11 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
         return cloud
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid := _without_scale(matrix, scale), 1e-3):
-        raise InputError(
-            "a node of the GLB file is mirrored or scaled unevenly", where=where, got=str(matrix[:3, :3].tolist())
-        )
+        raise InputError("a node of the GLB file is mirrored or scaled unevenly", where=where, got=str(matrix[:3, :3].tolist()),
+            remedy="apply the scale of the node to its Gaussians in the program that wrote the file")  # fmt: skip
     if scale != 1:
-        grown = (cloud.means * np.float32(scale)).astype(np.float32)
         logs = (cloud.log_scales + np.float32(np.log(scale))).astype(np.float32)
-        cloud = checked(SplatCloud(grown, cloud.quats, logs, cloud.logits, cloud.sh), where)
+        cloud = checked(replace(cloud, means=cloud.means * scale, log_scales=logs), where)
     return cloud.moved(rigid)
 
 
@@ -88,12 +111,38 @@ class _GlbFile:
             raise InputError("the document of a GLB file is an object", where=f"{where}: JSON")
         self.document: dict[str, Any] = document
         self.binary = memoryview(b"")
-        self.total = 0
+        self.total, self.step_m = 0, 0.0
+        self.passed: set[str] = set()
+        self.notes, self.warnings = dict[str, None](), dict[str, None]()  # each once, in order
+        asset = document.get("asset")
+        asset = asset if isinstance(asset, dict) else {}
+        self.generator = "".join(c for c in str(asset.get("generator", ""))[:60] if c.isprintable())
+        extras = asset.get("extras")
+        drawing = extras.get("drawing") if isinstance(extras, dict) else None
+        self.antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
+        self._check_extensions()
         place = 20 + length
         if place < len(content):
             length, kind = binary.unpacked("<II", content, place, "the second chunk", where)
             if kind == BIN_CHUNK:
                 self.binary = binary.part(content, place + 8, length, "the binary chunk", where)
+
+    def _check_extensions(self) -> None:
+        """Refuse a file that cannot be read without extensions that are not known here; list those that it can be read without."""
+        for name in ("extensionsRequired", "extensionsUsed"):
+            stated = self.document.get(name, [])
+            if not isinstance(stated, list) or any(not isinstance(one, str) for one in stated):
+                raise InputError(f"{name} is no list of names", where=f"{self.where}: JSON", got=repr(stated)[:60])
+            unknown = [one for one in stated if one not in _READ]
+            if unknown and name == "extensionsRequired":
+                raise InputError("the GLB file needs an extension that is not read", where=f"{self.where}: JSON",
+                    got=binary.listed(unknown), expected=", ".join(_READ), remedy="write the file without it, or as SPZ")  # fmt: skip
+            self.passed.update(unknown)
+
+    def of_old_transform(self, before: int) -> bool:
+        """Whether splat-transform of a major version below this one wrote the file."""
+        match = re.match(r"splat-transform v?(\d{1,4})\.", self.generator)
+        return match is not None and int(match[1]) < before
 
     def entries(self, owner: dict[str, Any], name: str) -> list[dict[str, Any]]:
         """A list of objects in the document; empty if it is not there."""
@@ -152,6 +201,14 @@ class _GlbFile:
                 )
             seen.add(index)
             matrix = matrix @ self._matrix(node)
+            extensions = node.get("extensions")
+            extensions = extensions if isinstance(extensions, dict) else {}
+            visible = extensions.get("KHR_node_visibility")
+            if isinstance(visible, dict) and visible.get("visible") is False:
+                self.warnings["nodes that the file hides were left out"] = None
+                continue
+            if "EXT_mesh_gpu_instancing" in extensions:
+                self.warnings["instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once"] = None
             if "mesh" in node:
                 yield matrix, self.entry("meshes", node["mesh"])
             waiting += [(matrix, child, depth + 1) for child in self._indices(node, "children")]
@@ -186,6 +243,22 @@ class _GlbFile:
             raise InputError(
                 "only ellipsoids are read", where=f"{self.where}: {EXTENSION}", got=repr(kind.get("kernel"))[:40]
             )
+        space = kind.get("colorSpace")
+        if space is None:
+            self.warnings["it names no colorSpace, which the standard requires: read as sRGB"] = None
+        elif not isinstance(space, str) or space not in _LINEAR:
+            raise InputError("the colour space of the Gaussians is not known", where=f"{self.where}: {EXTENSION}: colorSpace",
+                expected=", ".join(_LINEAR), got=repr(space)[:60], remedy="convert the colours to sRGB")  # fmt: skip
+        inner = kind.get("extensions")
+        compressed = [name for name in inner if "compression" in name] if isinstance(inner, dict) else []
+        if compressed:
+            raise InputError("the Gaussians of the GLB file are compressed", where=f"{self.where}: {EXTENSION}",
+                got=binary.listed(compressed), expected="attributes without compression", remedy="write it without, or as SPZ")  # fmt: skip
+        self.passed.update(f"{EXTENSION}.{name}" for name in kind if name not in _KIND)
+        self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
+        for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
+            if kind.get(name, usual) != usual:
+                self.warnings[f"{name} {kind[name]!r:.40} is not drawn: {usual} instead"] = None
         means = self.values(attributes, "POSITION", 3)
         count = len(means)
         self.total += count
@@ -196,9 +269,13 @@ class _GlbFile:
                 got=f"{self.total} Gaussians",
             )
         rotation = self.values(attributes, PREFIX + "ROTATION", 4, count)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logs = np.maximum(np.log(self.values(attributes, PREFIX + "SCALE", 3, count)), LEAST_LOG)
+        if np.abs(np.linalg.norm(rotation, axis=1) - 1).max(initial=0) > 0.05:
+            self.warnings["rotations are not of length 1, as the standard requires: they were brought to it"] = None
+        scale = self.values(attributes, PREFIX + "SCALE", 3, count)
         opacity = self.values(attributes, PREFIX + "OPACITY", 1, count)[:, 0]
+        if not np.isfinite(opacity).all():
+            raise InputError("the opacity of a Gaussian is not finite", where=self.where)
+        logits, logs = self._logits_and_logs(opacity, scale)
         degrees = [d for d in range(4) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in attributes]
         if degrees != list(range(len(degrees))) or not degrees:
             raise InputError(
@@ -212,12 +289,33 @@ class _GlbFile:
             ],
             1,
         )
-        if kind.get("colorSpace") == "lin_rec709_display":
+        if _LINEAR.get(str(space), False):
             sh = _of_display(sh)
-        columns = [values.astype(np.float32) for values in (means, rotation[:, [3, 0, 1, 2]], logs)]
-        if not np.isfinite(opacity).all():
-            raise InputError("the opacity of a Gaussian is not finite", where=self.where)
-        return checked(SplatCloud(*columns, logit(opacity), sh.astype(np.float32)), self.where)
+        read = tuple(f"{PREFIX}SH_DEGREE_{d}_" for d in degrees)
+        beyond = [name for name in attributes if name.startswith(f"{PREFIX}SH_DEGREE_") and not name.startswith(read)]
+        if beyond:
+            self.warnings[f"harmonics beyond degree 3 were dropped: {binary.listed(beyond)}"] = None
+        self.step_m = max(self.step_m, spacing_m(means))
+        columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
+        return checked(SplatCloud(means, *columns), self.where)
+
+    def _logits_and_logs(self, opacity: Array, scale: Array) -> tuple[NDArray[np.floating], Array]:
+        """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and sizes."""
+        raw = (scale < 0).any() or (opacity < -_ROUNDING).any() or (opacity > 1 + _ROUNDING).any()
+        if raw and self.of_old_transform(3):
+            self.warnings[f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so"] = None
+            return opacity, scale
+        if (bad := (opacity < -_ROUNDING) | (opacity > 1 + _ROUNDING)).any():
+            row = int(bad.argmax())
+            raise InputError("the opacity of a Gaussian is not between 0 and 1", where=f"{self.where}: Gaussian {row}", expected="0 to 1",
+                got=f"{opacity[row]:.4g}; {int(bad.sum())} of {len(opacity)}: they look like logits",
+                remedy="write 1 / (1 + exp(-logit)) into the file")  # fmt: skip
+        if raw:
+            row = int((scale < 0).any(1).argmax())
+            raise InputError("the size of a Gaussian is negative", where=f"{self.where}: Gaussian {row}", expected="metres",
+                got=f"{scale[row].tolist()}: they look like logarithms", remedy="write exp(scale) into the file")  # fmt: skip
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return logit(opacity), np.maximum(np.log(scale), LEAST_LOG)
 
     def values(self, attributes: dict[str, Any], name: str, width: int, count: int | None = None) -> Array:
         """An attribute as f64[count, width], normalised integers as numbers."""
@@ -239,6 +337,12 @@ class _GlbFile:
             raise InputError("the attributes of the Gaussians differ in length", where=f"{self.where}: {name}", expected=str(count),
                 got=str(rows))  # fmt: skip
         view = self.entry("bufferViews", accessor.get("bufferView"))
+        packed = view.get("extensions")
+        buffers = self.entries(self.document, "buffers")
+        if view.get("buffer", 0) != 0 or packed or (buffers and "uri" in buffers[0]):
+            raise InputError("an attribute of the Gaussians lies outside the file, or is compressed", where=f"{self.where}: {name}",
+                expected="the binary chunk", got=f"buffer {view.get('buffer', 0)!r:.20}, extensions {binary.listed(packed or ())}",
+                remedy="pack the file with its buffers, without compression")  # fmt: skip
         stride = self.number(view, "byteStride", 0) or width * dtype.itemsize
         begins, inner = self.number(view, "byteOffset", 0), self.number(accessor, "byteOffset", 0)
         size = (rows - 1) * stride + width * dtype.itemsize

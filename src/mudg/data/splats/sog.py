@@ -4,6 +4,7 @@ means_l, means_u   low and high byte of 16 bits of sign(x) ln(|x| + 1), between 
 quats              r g b: the three smallest of (w, x, y, z) times sqrt 2, as (v + 1) / 2; alpha: 252 + index of the largest
 scales, sh0        index into a table of 256 values: natural logarithms of sizes; f_dc, with the opacity in alpha
 shN_labels         16 bits (red, green): which row of ``shN_centroids``; these hold indices into another table of 256 values
+meta.json          besides: ``antialias``, or in newer files ``model``: default, antialiased, 2dgs
 """
 
 from __future__ import annotations
@@ -21,14 +22,15 @@ from scipy.spatial import cKDTree
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.data.splats import binary
-from mudg.data.splats.cloud import SplatCloud, checked, logit
+from mudg.data.splats.cloud import SplatCloud, SplatFile, checked, logit
 
 CODES: Final = 256
 MAX_PALETTE: Final = 65536
 ROUNDS: Final = 8
 _MOST_META: Final = 1 << 20
+_MODELS: Final = (None, "default", "3dgs", "antialiased", "2dgs")
 _WIDTH: Final = 64
 """Centroids beside each other in their picture."""
 
@@ -40,7 +42,7 @@ One = Annotated[list[str], Field(min_length=1, max_length=1)]
 Two = Annotated[list[str], Field(min_length=2, max_length=2)]
 
 
-class SogMeans(StrictRecord):
+class SogMeans(ForeignRecord):
     """Bounds of the transformed places, and their pictures."""
 
     mins: Three
@@ -48,20 +50,20 @@ class SogMeans(StrictRecord):
     files: Two
 
 
-class SogTable(StrictRecord):
+class SogTable(ForeignRecord):
     """A table of values, and the picture of indices."""
 
     codebook: Codebook
     files: One
 
 
-class SogRotations(StrictRecord):
+class SogRotations(ForeignRecord):
     """The picture of rotations."""
 
     files: One
 
 
-class SogHarmonics(StrictRecord):
+class SogHarmonics(ForeignRecord):
     """The palette of harmonics from degree 1 on."""
 
     count: Annotated[int, Field(gt=0, le=MAX_PALETTE)]
@@ -70,7 +72,7 @@ class SogHarmonics(StrictRecord):
     files: Two
 
 
-class SogMeta(StrictRecord):
+class SogMeta(ForeignRecord):
     """``meta.json``."""
 
     version: Literal[2]
@@ -80,8 +82,9 @@ class SogMeta(StrictRecord):
     quats: SogRotations
     sh0: SogTable
     shN: SogHarmonics | None = None
-    asset: dict[str, Any] | None = None
+    asset: Any = None
     antialias: bool | None = None
+    model: Any = None
 
 
 # -- writing -------------------------------------------------------------------------------------------------------------
@@ -111,7 +114,7 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
     }  # fmt: skip
     if antialias:
-        meta["antialias"] = True
+        meta |= {"antialias": True, "model": "antialiased"}  # for programs before and since splat-transform 3.2
     pictures = {name: _webp(_laid_out(rgba.astype(np.uint8))) for name, rgba in files.items()}
     if cloud.degree:
         palette, labels = _palette(cloud.sh[:, 1:].reshape(len(cloud), -1))
@@ -187,8 +190,8 @@ def _webp(picture: Picture) -> bytes:
 # -- reading -------------------------------------------------------------------------------------------------------------
 
 
-def from_bytes(content: bytes, where: str) -> SplatCloud:
-    """The Gaussians of a SOG file.
+def from_bytes(content: bytes, where: str) -> SplatFile:
+    """The Gaussians of a SOG file; fields that it does not know are passed over.
 
     Raises:
         InputError: no SOG file of version 2, or a damaged one.
@@ -196,17 +199,14 @@ def from_bytes(content: bytes, where: str) -> SplatCloud:
     archive = binary.BoundedZip(content, where)
     names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
     if not names:
-        raise InputError(
-            "the zip is no SOG file",
-            where=where,
-            expected="meta.json",
-            got=", ".join(archive.names[:6]) or "an empty zip",
-        )
+        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=binary.listed(archive.names) or "an empty zip",
+            remedy="of a bundle, give the PLY files within" if "bundle.json" in archive.names else "")  # fmt: skip
     folder = names[0].removesuffix("meta.json")
     stated = store.parse_json(archive.read(names[0], _MOST_META), f"{where}: {names[0]}")
     if isinstance(stated, dict) and stated.get("version") != 2:
         raise InputError(
-            "this version of SOG is not read", where=where, expected="2", got=str(stated.get("version"))[:20]
+            "this version of SOG is not read", where=where, expected="2", got=str(stated.get("version", "1 (none stated)"))[:20],
+            remedy="convert it, for example with splat-transform",
         )
     meta = parse_record(SogMeta, stated, f"{where}: {names[0]}: ")
     binary.refuse_count(meta.count, where)
@@ -228,8 +228,14 @@ def from_bytes(content: bytes, where: str) -> SplatCloud:
     sh = np.array(meta.sh0.codebook)[first[:, :3]][:, None]
     if meta.shN is not None:
         sh = np.concatenate([sh, _harmonics(meta.shN, pixels, where)], 1)
-    columns = [values.astype(np.float32) for values in (means, quats, scales)]
-    return checked(SplatCloud(*columns, logit(first[:, 3] / 255.0), sh.astype(np.float32)), where)
+    columns = [values.astype(np.float32) for values in (quats, scales)]
+    antialias = meta.model == "antialiased" if meta.model is not None else bool(meta.antialias)
+    cloud = checked(SplatCloud(means, *columns, logit(first[:, 3] / 255.0), sh.astype(np.float32), None, antialias), where)
+    unknown = meta.unknown()
+    notes = (f"fields of meta.json passed over: {binary.listed(unknown)}",) if unknown else ()
+    if meta.model in _MODELS:
+        return SplatFile(cloud, notes=notes)
+    return SplatFile(cloud, notes=notes, warnings=(f"its model {str(meta.model)[:40]!r} is not known: drawn as usual",))
 
 
 def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from mudg.base.errors import InputError
 from mudg.core.sh import C0
 from mudg.data.splats import binary
-from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, checked, logit
+from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, SplatFile, checked, logit, spacing_m
 
 ROW: Final = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -29,7 +29,7 @@ def to_bytes(cloud: SplatCloud) -> bytes:
     return rows.tobytes()
 
 
-def from_bytes(content: bytes, where: str) -> SplatCloud:
+def from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of a .splat file.
 
     Raises:
@@ -43,10 +43,11 @@ def from_bytes(content: bytes, where: str) -> SplatCloud:
     scales = rows["scales"].astype(np.float64)
     if (scales < 0).any():
         raise InputError("the size of a Gaussian is negative", where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}",
-            remedy="this is not a .splat file")  # fmt: skip
+            remedy="a .splat file holds sizes in metres, not their logarithms: write exp(scale)")  # fmt: skip
     with np.errstate(divide="ignore"):
         logs = np.maximum(np.log(scales), LEAST_LOG)
     rgba = rows["rgba"] / 255
     sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)
     quats = (rows["quats"] / 255 * 2 - 1).astype(np.float32)
-    return checked(SplatCloud(rows["means"].copy(), quats, logs.astype(np.float32), logit(rgba[:, 3]), sh), where)
+    cloud = checked(SplatCloud(rows["means"].astype(np.float64), quats, logs.astype(np.float32), logit(rgba[:, 3]), sh), where)
+    return SplatFile(cloud, step_m=spacing_m(rows["means"]))

@@ -42,8 +42,9 @@ class ImportConfig:
     yaw_deg: float = 0.0
     """Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads,
     along x."""
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg. As a background of an edit
-    script, a street begins there."""
-    axes: Literal["viewer", "world"] = "viewer"
-    """Axes of the file. viewer: those that programs expect of its format. world: x forward, y left, z up, as of --axes world."""
+    origin_m: tuple[float, float, float] | None = None
+    """With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own
+    origin, or the middle of Gaussians that lie more than 16 km away). As a background of an edit script, a street begins there."""
+    axes: str = Field(default="file", pattern="^(file|viewer|world|[LRUDFB]{3})$")
+    """Where x, y and z of the file point. file: as the file says, else as viewer. viewer: as programs expect of its format. world: x
+    forward, y left, z up, as of export --axes world. Or three letters of L, R, U, D, F, B: RDF is x right, y down, z forward."""

@@ -15,9 +15,10 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.result_file import ResultFile
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.data.splats import axes
 from mudg.data.splats.binary import MAX_BYTES
-from mudg.data.splats.cloud import SplatCloud
-from mudg.data.splats.formats import read_cloud
+from mudg.data.splats.cloud import SplatCloud, spacing_m
+from mudg.data.splats.formats import COARSE_M, read_cloud
 from mudg.models.scene.edited import Asset
 from mudg.stages.config import ImportConfig
 from mudg.stages.editing.assets import write_asset
@@ -79,7 +80,10 @@ def refuse_other_settings(config: ImportConfig) -> None:
     usual = ImportConfig()
     if config.kind == "scene" and (config.label, config.length_m) != (usual.label, usual.length_m):
         raise UsageError("a scene takes no settings of objects", where="--label, --length-m", remedy="leave them out")
-    if config.kind == "object" and config.origin_m != usual.origin_m:
+    if len(config.axes) == 3 and not axes.known(config.axes):
+        raise UsageError("these letters name no three axes", where="--axes", expected="one of L and R, one of U and D, one of F and B",
+            got=config.axes)  # fmt: skip
+    if config.kind == "object" and config.origin_m is not None:
         raise UsageError(
             "an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene"
         )
@@ -110,6 +114,8 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
     size = np.maximum(high - low, 1e-3)
     scale = 1.0 if config.length_m is None else config.length_m / float(size[0])
     means = ((cloud.means - (low + high) / 2) * scale).astype(np.float32)
+    if cloud.antialias:
+        log.warn(f"{origin}: its Gaussians are meant to be drawn antialiased; an object is drawn as the scene that it stands in")
     logs = (cloud.log_scales + np.log(scale)).astype(np.float32)
     columns = {
         "means": means,
@@ -133,11 +139,22 @@ def _scene(config: ImportConfig, file: Path, out: Path, overwrite: bool) -> Path
     folder = RunDir.open(out, _FOLDER, result_settings(config), {"file": store.digest(file)}, overwrite)
     if folder.complete:
         return folder.reused()
-    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(
-        0.0, [-value for value in config.origin_m]
-    )
+    origin = _origin(cloud, config, file)
+    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(0.0, [-value for value in origin])
     model = model_of_cloud(cloud.moved(begin), file.name)
     save_model(replace(model, facts={**model.facts, "format": found}), folder.path)
-    folder.finish({"gaussians": len(cloud), "format": found})
+    folder.finish({"gaussians": len(cloud), "format": found, "origin_m": origin})
     log.info(f"asset: a scene of {len(cloud)} Gaussians of a {found} file in {out}")
     return folder.path
+
+
+def _origin(cloud: SplatCloud, config: ImportConfig, file: Path) -> list[float]:
+    """What is taken away from the places, in f64: as set, or the middle of Gaussians so far away that f32 would be too coarse for them."""
+    origin = [0.0, 0.0, 0.0] if config.origin_m is None else list(config.origin_m)
+    if config.origin_m is None and spacing_m(cloud.means) > COARSE_M:
+        origin = [float(value) for value in np.round(np.median(cloud.means, 0))]
+        log.warn(f"{file}: its Gaussians lie far from the origin of the file: {origin} becomes the origin; --origin-m sets another")
+    if (step := spacing_m(cloud.means - np.array(origin))) > COARSE_M:
+        log.warn(f"{file}: its Gaussians lie so far from the origin that their places are rounded to {step * 1000:.3g} mm; "
+                 "--origin-m takes an offset away before")  # fmt: skip
+    return origin

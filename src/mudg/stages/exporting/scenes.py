@@ -22,6 +22,7 @@ from mudg.models.scene.model import COLUMNS, SceneModel
 from mudg.models.scene.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
 from mudg.stages.editing.carried import IMPORTED
+from mudg.stages.fitting.rendering import DRAWING
 
 SKY_COUNT: Final = 6000
 SKY_M: Final = 300.0
@@ -178,4 +179,5 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
         )
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
-    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name})
+    drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
+    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name, **drawing})

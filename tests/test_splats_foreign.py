@@ -1,0 +1,588 @@
+"""Files of Gaussians as other programs write them: what they mean is kept, said or refused. All bytes are written here by hand
+(``foreign_splats.py``), all values worked out here."""
+
+from __future__ import annotations
+
+import gzip
+import importlib.util
+import io
+import json
+import math
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import foreign_splats as foreign
+import numpy as np
+import pytest
+import toy_splats
+from foreign_splats import C1, F_REST, ROWS, rows
+
+from mudg import cli
+from mudg.base.errors import InputError
+from mudg.data.splats import formats
+from mudg.data.splats.cloud import SplatCloud
+from mudg.stages.editing.assets import read_asset
+from mudg.stages.fitting.rendering import raster_of
+from mudg.stages.fitting.storage import load_model
+
+UNIT = {"F": (1, 0, 0), "B": (-1, 0, 0), "L": (0, 1, 0), "R": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
+"""The world: x forward, y left, z up."""
+PLACES = np.array([[row[name] for name in "xyz"] for row in ROWS])
+FACES = ("element face 2\nproperty list uchar int vertex_indices", b"\3" + bytes(12) + b"\4" + bytes(16))
+zstandard = pytest.mark.skipif(importlib.util.find_spec("zstandard") is None, reason="needs zstandard")
+
+
+def world(places: np.ndarray, axes: str) -> np.ndarray:
+    """Places [n, 3] of a file whose x, y and z point along three letters."""
+    return sum(places[:, [n]] * np.array(UNIT[letter]) for n, letter in enumerate(axes))
+
+
+def covariance(row: dict[str, float]) -> np.ndarray:
+    """Of a row of `ROWS`, in the file's axes."""
+    w, x, y, z = (row[f"rot_{n}"] for n in range(4))
+    turn = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    return turn @ np.diag([math.exp(2 * row[f"scale_{n}"]) for n in range(3)]) @ turn.T
+
+
+def shape(cloud: SplatCloud, index: int) -> np.ndarray:
+    """Covariance of a Gaussian that was read."""
+    row = {f"rot_{n}": float(cloud.quats[index, n]) for n in range(4)} | {f"scale_{n}": float(cloud.log_scales[index, n]) for n in range(3)}
+    return covariance(row)
+
+
+def colors(dc: np.ndarray, first: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Colours [d, 3] less the constant, of harmonics dc [3] and first [3, 3] (rows: -y, z, -x) in directions [d, 3]."""
+    x, y, z = directions.T
+    return 0.28209479 * dc + C1 * np.stack([-y, z, -x], 1) @ first
+
+
+def read(content: bytes, name: str = "a.ply", axes: str = "file") -> SplatCloud:
+    return formats.read_cloud(content, name, axes)[0]
+
+
+def command(tmp_path: Path, content: bytes, suffix: str, *flags: str) -> int:
+    (tmp_path / f"in{suffix}").write_bytes(content)
+    out = str(tmp_path / "out")
+    return cli.main(["asset", "import", str(tmp_path / f"in{suffix}"), "--kind", "scene", "--out", out, "--overwrite", "--quiet", *flags])
+
+
+# -- drawing -------------------------------------------------------------------------------------------------------------
+
+MARKED: dict[str, tuple[bytes, str, bool]] = {
+    "ply Brush": (foreign.ply(head=["comment Exported from Brush", "comment SplatRenderMode: mip"]), ".ply", True),
+    "ply gsplat, default": (foreign.ply(head=["comment SplatRenderMode: default"]), ".ply", False),
+    "ply, the last one counts": (foreign.ply(head=["comment SplatRenderMode: mip", "comment splatrendermode: DEFAULT"]), ".ply", False),
+    "ply, small letters": (foreign.ply(head=["comment splatrendermode: Mip"]), ".ply", True),
+    "ply Postshot 1": (foreign.ply(head=["comment antialiased 1"]), ".ply", True),
+    "ply Postshot 0": (foreign.ply(head=["comment antialiased 0"]), ".ply", False),
+    "ply flags": (foreign.ply(head=["comment train_flags antialiasing"]), ".ply", True),
+    "ply nerfstudio": (foreign.ply(head=["comment rasterize_mode: antialiased"]), ".ply", True),
+    "ply obj_info": (foreign.ply(head=["obj_info anti_aliased: true"]), ".ply", True),
+    "ply silent": (foreign.ply(head=["comment made elsewhere"]), ".ply", False),
+    "compressed ply": (foreign.compressed_ply(-1, 1, head=["comment SplatRenderMode: mip"]), ".ply", True),
+    "compressed ply silent": (foreign.compressed_ply(-1, 1), ".ply", False),
+    **{f"spz {v} {flags}": (foreign.spz(v, flags), ".spz", bool(flags)) for v in (1, 2, 3) for flags in (0, 1)},
+    "sog antialias": (foreign.sog(antialias=True), ".sog", True),
+    "sog no antialias": (foreign.sog(antialias=False), ".sog", False),
+    "sog model": (foreign.sog(model="antialiased"), ".sog", True),
+    "sog model default": (foreign.sog(model="default", antialias=True), ".sog", False),
+    "sog 2dgs": (foreign.sog(model="2dgs"), ".sog", False),
+    "glb facts": (foreign.glb(document={"asset": {"version": "2.0", "extras": {"drawing": {"antialias": True}}}}), ".glb", True),
+    "glb silent": (foreign.glb(), ".glb", False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MARKED)
+def test_marks_of_antialiasing_are_read(name: str) -> None:
+    content, suffix, wanted = MARKED[name]
+    assert read(content, "a" + suffix).antialias is wanted
+
+
+@zstandard
+@pytest.mark.parametrize("flags", [0, 1])
+def test_marks_of_spz_4_are_read(flags: int) -> None:
+    assert read(foreign.spz(4, flags), "a.spz").antialias is bool(flags)
+
+
+@pytest.mark.parametrize("name", ["ply Brush", "spz 3 1", "sog model", "glb facts", "ply silent"])
+def test_an_imported_scene_is_drawn_as_its_file_says(name: str, tmp_path: Path) -> None:
+    content, suffix, wanted = MARKED[name]
+    assert command(tmp_path, content, suffix) == 0
+    model = load_model(tmp_path / "out")
+    assert raster_of(model).antialias is wanted
+    assert model.facts.get("drawing") == ({"antialias": True} if wanted else None)
+
+
+def test_what_is_drawn_antialiased_is_exported_with_the_marks_of_each_format() -> None:
+    scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", toy_splats.cloud(5)),), facts={"drawing": {"antialias": True}})
+    written = {name: formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0)) for name in ("ply", "compressed-ply", "spz", "sog", "glb")}
+    for name in ("ply", "compressed-ply"):
+        assert b"\ncomment SplatRenderMode: mip\n" in written[name].partition(b"end_header")[0]
+    assert gzip.decompress(written["spz"])[14] == 1
+    meta = json.loads(zipfile.ZipFile(io.BytesIO(written["sog"])).read("meta.json"))
+    assert meta["antialias"] is True and meta["model"] == "antialiased"
+    assert all(read(content, f"a.{name}").antialias for name, content in written.items())
+    assert not any(formats.losses(name, formats.WriteRequest(scene, 0.0)) for name in written)
+
+
+def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.ply").write_bytes(MARKED["ply Brush"][0])
+    assert cli.main(["asset", "import", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.safetensors")]) == 0
+    assert "antialiased" in capsys.readouterr().err
+
+
+# -- sizes and opacities -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("column", ["filter_3D", "filter_3d"])
+@pytest.mark.parametrize("kind", ["float", "double"])
+def test_the_filter_of_mip_splatting_goes_into_sizes_and_opacities(column: str, kind: str) -> None:
+    filters = [0.2, 0.0, 3.0]
+    cloud = read(foreign.ply(rows(**{column: filters}), kinds={column: kind}))
+    for n, (row, filter_m) in enumerate(zip(ROWS, filters, strict=True)):
+        sizes = [math.exp(row[f"scale_{c}"]) for c in range(3)]
+        grown = [math.hypot(size, filter_m) for size in sizes]
+        assert np.allclose(np.exp(cloud.log_scales[n]), grown, rtol=1e-5)
+        opacity = 1 / (1 + math.exp(-row["opacity"])) * math.prod(sizes) / math.prod(grown)
+        assert cloud.opacity[n] == pytest.approx(opacity, abs=1e-5)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_filter_that_is_no_number_is_refused(value: float) -> None:
+    with pytest.raises(InputError, match="filter_3D"):
+        read(foreign.ply(rows(filter_3D=[0.1, value, 0.1])))
+
+
+def test_flat_gaussians_of_2dgs_are_read_flat() -> None:
+    cloud = read(foreign.ply(rows(scale_2=None)), axes="world")
+    assert np.allclose(cloud.log_scales[:, :2], [[row["scale_0"], row["scale_1"]] for row in ROWS])
+    assert (np.exp(cloud.log_scales[:, 2]) <= 1e-6).all()
+    normal = shape(cloud, 1) @ [1, 0, 0]  # the second is turned so that z becomes x
+    assert np.abs(normal).max() < 1e-11
+
+
+LINEAR = {"opacity": [0.9, 0.2, 0.7], "scale_0": [0.1, 0.3, 0.2], "scale_1": [0.2, 0.1, 0.3], "scale_2": [0.01, 0.05, 0.2]}
+
+
+def test_plain_sizes_and_opacities_are_refused_where_logarithms_and_logits_are_due() -> None:
+    with pytest.raises(InputError, match=r"plain values[\s\S]*log\(scale\)"):
+        read(foreign.ply(rows(**LINEAR)))
+    with pytest.raises(InputError, match="plain values"):
+        read(foreign.ply(rows(**LINEAR | {"scale_2": None})))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"opacity": [0.9, 0.2, 0.7]}, "logits are due"),
+        ({"opacity": 1.0}, "logits are due"),
+        ({name: LINEAR[name] for name in ("scale_0", "scale_1", "scale_2")}, "logarithms are due"),
+        ({"opacity": [255.0, 40.0, 128.0]}, "from 0 to 255"),
+        ({"f_dc_0": 200.0, "f_dc_1": 120.0, "f_dc_2": 90.0}, "from 0 to 255"),
+        ({"trbf_center": 0.5, "motion_0": 0.1}, "motion over time are not read: trbf_center, motion_0"),
+    ],
+)
+def test_values_and_columns_of_another_kind_are_named(changes: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    read(foreign.ply(rows(**changes)))
+    assert said in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -> None:
+    for content, name in ((foreign.ply(), "a.ply"), (foreign.spz(), "a.spz"), (foreign.glb(), "a.glb"), (foreign.splat(), "a.splat"),
+                          (foreign.sog(), "a.sog"), (foreign.ply(rows(opacity=0.0, scale_0=0.0, scale_1=0.0)), "zero.ply"),
+                          (foreign.compressed_ply(-9, 9), "c.ply")):  # fmt: skip
+        read(content, name)
+    assert "warning" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("column", ["opacity", "scale_1", "f_dc_0", "rot_2"])
+def test_whole_numbers_are_refused(column: str) -> None:
+    with pytest.raises(InputError, match=rf"whole numbers[\s\S]*{column}"):
+        read(foreign.ply(rows(**{column: 1}), kinds={column: "uchar"}))
+
+
+def test_a_splat_file_of_logarithms_says_what_to_do() -> None:
+    with pytest.raises(InputError, match=r"negative[\s\S]*exp\(scale\)"):
+        read(foreign.splat(logs=True), "a.splat")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rot_0": [1.0, 0.0, 1.0], "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0}, r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out"),
+        ({"scale_1": [0.0, 0.0, math.nan]}, r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
+        ({"x": [math.inf, 0.0, 0.0]}, r"Gaussian 0[\s\S]*take them out"),
+    ],
+)
+def test_damaged_gaussians_are_counted_and_the_remedy_named(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read(foreign.ply(rows(**changes)))
+
+
+def test_rotations_of_any_length_are_brought_to_1() -> None:
+    long = {f"rot_{n}": [7.5 * row[f"rot_{n}"] for row in ROWS] for n in range(4)}
+    assert np.allclose(read(foreign.ply(rows(**long))).quats, read(foreign.ply()).quats, atol=1e-6)
+
+
+# -- other elements and columns ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    "around",
+    [
+        {"after": ("element face 0\nproperty list uchar int vertex_indices", b"")},
+        {"after": FACES},
+        {"after": ("element edge 1\nproperty int a\nproperty list int float b", b"cut")},
+        {"before": ("element camera 1\nproperty float focal\nproperty uchar k", b"abcde")},
+        {"before": ("element empty 5", b"")},
+        {"before": ("element face 0\nproperty list uchar uint vertex_index", b""), "after": FACES},
+    ],
+)
+def test_other_elements_of_a_ply_are_passed_over(around: dict[str, Any], order: str) -> None:
+    assert np.array_equal(read(foreign.ply(order=order, **around), axes="world").means, PLACES)
+
+
+def test_lists_before_the_gaussians_are_walked_over() -> None:
+    lines = "element face 3\nproperty uchar flag\nproperty list ushort double weights\nproperty list uchar uchar more"
+    body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc" + b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
+    assert np.array_equal(read(foreign.ply(before=(lines, body)), axes="world").means, PLACES)
+
+
+@pytest.mark.parametrize(
+    ("around", "said"),
+    [
+        ({"before": ("element face 9000000\nproperty list uchar int vertex_indices", b"")}, "too many lists"),
+        ({"before": ("element face 9\nproperty list uchar int vertex_indices", b"\xff" * 3)}, "in.ply"),
+        ({"before": ("element face 1\nproperty list float int vertex_indices", b"")}, "not understood"),
+        ({"before": ("element vertex 1\nproperty list uchar float features", b"\0")}, "lists"),
+    ],
+)
+def test_lists_that_cannot_be_passed_over_are_refused(around: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read(foreign.ply(**around), "in.ply")
+
+
+def test_unknown_columns_are_listed_once_and_without_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    read(foreign.ply(rows(confidence=1.0, **{"a\x1b[31m": 0.0}, **{f"extra_{n:02}": 0.0 for n in range(20)})))
+    said = capsys.readouterr().err
+    assert said.count("confidence") == 1 and "\x1b[31m" not in said and "more" in said
+
+
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [({"f_dc_0": None, "red": 1.0}, "f_dc_0"), ({"rot_0": None, "quat_w": 1.0}, "rot_0"), ({"scale_1": None, "scale_2": None}, "scale_1"),
+     ({"opacity": None, "alpha": 1.0}, "opacity")],
+)  # fmt: skip
+def test_gaussians_with_columns_of_other_names_get_the_right_remedy(changes: dict[str, Any], missing: str) -> None:
+    with pytest.raises(InputError, match=rf"missing[\s\S]*'{missing}'[\s\S]*name the columns"):
+        read(foreign.ply(rows(**changes)))
+
+
+def test_points_are_still_called_points() -> None:
+    with pytest.raises(InputError, match="points or meshes"):
+        read(foreign.ply([{"x": 0.0, "y": 0.0, "z": 0.0, "red": 1.0}]))
+
+
+def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = read(foreign.sog(extras={"a": 1}, lod=3, **{"means.order": "morton", "sh0.gamma": 2}), "a.sog")
+    said = capsys.readouterr().err.replace("\n", " ")
+    assert "extras, lod, means.order, sh0.gamma" in said and "warning" not in said
+    assert np.allclose(sorted(np.abs(cloud.means).max(1)), [0, math.e - 1])
+    assert read(foreign.compressed_ply(-1, 1, more="state"), "a.ply").opacity[0] == pytest.approx(200 / 255, abs=1e-6)
+    read(foreign.glb(kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}), "a.glb")
+    assert "EXT_other, KHR_gaussian_splatting.lod" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize("model", ["gabor", 7, {"name": "x"}])
+def test_an_unknown_model_of_sog_is_read_with_a_word(model: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(read(foreign.sog(model=model), "a.sog")) == 2
+    assert "not known" in capsys.readouterr().err
+
+
+# -- axes ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("comment", "axes"),
+    [
+        ("comment Vertical Axis: z", "FLU"), ("comment Vertical axis: Z", "FLU"), ("comment up_axis = +z", "FLU"), ("comment Z-up", "FLU"),
+        ("comment Vertical Axis: -y", "RDF"), ("comment y-up", "RUB"), ("comment Vertical Axis: x", "UFL"),
+        ("comment coordinate_system: RUB", "RUB"), ("obj_info Vertical Axis: z", "FLU"), ("comment size up to z9", "RDF"),
+        ("comment Vertical Axis: y", "RDF"), ("comment made elsewhere", "RDF"),
+    ],
+)  # fmt: skip
+def test_axes_of_a_ply_are_those_that_its_comments_state(comment: str, axes: str) -> None:
+    cloud = read(foreign.ply(head=["comment Generated by Nerfstudio 1.1.5", comment]))
+    assert np.allclose(cloud.means, world(PLACES, axes))
+
+
+def test_a_vertical_axis_y_that_may_mean_down_is_said_unless_brush_wrote_it(capsys: pytest.CaptureFixture[str]) -> None:
+    read(foreign.ply(head=["comment Vertical Axis: y"]))
+    assert "--axes RUB" in capsys.readouterr().err
+    read(foreign.ply(head=["comment Exported from Brush", "comment Vertical axis: y"]))
+    assert "--axes" not in capsys.readouterr().err
+
+
+SPZ_AXES = ["RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
+"""By the number in the extension; 0 is unspecified."""
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, pytest.param(4, marks=zstandard)])
+@pytest.mark.parametrize("code", range(17))
+def test_axes_of_spz_are_those_of_its_extension(code: int, version: int) -> None:
+    axes = SPZ_AXES[code]
+    cloud = read(foreign.spz(version, 2, [(0xADBE0002, bytes(12)), (0xADBE0003, struct.pack("<I", code))]), "a.spz")
+    assert np.allclose(cloud.means, world(PLACES, axes), atol=2e-3 if version == 1 else 2e-4)
+    turn = np.array([UNIT[letter] for letter in axes]).T
+    ways = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
+    for n, row in enumerate(ROWS):
+        assert np.allclose(shape(cloud, n), turn @ covariance(row) @ turn.T, atol=0.1 * max(math.exp(2 * row[f"scale_{c}"]) for c in range(3)))
+        dc, first = np.array([row[f"f_dc_{c}"] for c in range(3)]), np.array(F_REST).reshape(3, 3).T
+        assert np.allclose(colors(cloud.sh[n, 0], cloud.sh[n, 1:4], ways), colors(dc, first, ways @ turn), atol=0.02)
+
+
+@pytest.mark.parametrize(("payload", "said"), [(struct.pack("<I", 17), "0xadbe0003"), (b"\6", "0xadbe0003"), (bytes(8), "0xadbe0003")])
+def test_axes_of_spz_that_are_not_known_are_refused(payload: bytes, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read(foreign.spz(3, 2, [(0xADBE0003, payload)]), "a.spz")
+
+
+def test_an_extension_longer_than_the_file_is_refused() -> None:
+    with pytest.raises(InputError, match="a.spz"):
+        read(foreign.spz(3, 2, more=struct.pack("<II", 0xADBE0003, 400)), "a.spz")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (foreign.spz(3, 2, [(0x4E490001, bytes(64))]), "0x4e490001 (64 bytes)"),
+        (foreign.spz(3, 0x80, more=bytes(999)), "flags that are not known"),
+        (foreign.spz(3, 0, degree=4), "degree 3"),
+        (foreign.spz(3, 0, bits=8), "steps of 3.91 mm"),
+        pytest.param(foreign.spz(4), "--axes RDF", marks=zstandard),
+    ],
+)  # fmt: skip
+def test_what_an_spz_file_means_besides_is_said(content: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = read(content, "a.spz")
+    assert said in capsys.readouterr().err.replace("\n", " ")
+    assert np.allclose(cloud.means, world(PLACES, "RUB"), atol=4e-3) and cloud.degree <= 3
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_values_of_spz_of_every_version(version: int) -> None:
+    cloud = read(foreign.spz(version), "a.spz", "world")
+    assert np.allclose(cloud.means, PLACES, atol=2e-3)
+    for n, row in enumerate(ROWS):
+        assert abs(cloud.quats[n] @ [row[f"rot_{c}"] for c in range(4)]) > 0.99995
+        assert np.allclose(cloud.log_scales[n], [row[f"scale_{c}"] for c in range(3)], atol=1 / 32)
+        assert cloud.opacity[n] == pytest.approx(1 / (1 + math.exp(-row["opacity"])), abs=1 / 255)
+        assert np.allclose(cloud.sh[n, 1:].T.ravel(), F_REST, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("content", "suffix", "flag", "axes", "warned"),
+    [
+        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "viewer", "RDF", True),
+        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "world", "FLU", False),
+        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "file", "FLU", False),
+        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "RUB", "RUB", True),
+        (foreign.ply(), ".ply", "RUF", "RUF", False),
+        (foreign.spz(3, 2, [(0xADBE0003, struct.pack("<I", 6))]), ".spz", "viewer", "RUB", True),
+        (foreign.spz(), ".spz", "RDF", "RDF", False),
+        (foreign.glb(), ".glb", "LUF", "LUF", False),
+    ],
+)
+def test_axes_that_are_set_win_and_a_contradiction_is_said(
+    content: bytes, suffix: str, flag: str, axes: str, warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(tmp_path, content, suffix, "--axes", flag) == 0
+    assert np.allclose(load_model(tmp_path / "out").table["means"].detach().numpy(), world(PLACES, axes), atol=3e-4)
+    assert (f"--axes {flag}" in capsys.readouterr().err.replace("\n", " ")) is warned
+
+
+@pytest.mark.parametrize("flag", ["RRU", "XYZ", "rdf", "RDFB", "LRU", ""])
+def test_letters_that_are_no_axes_are_refused(flag: str, tmp_path: Path) -> None:
+    assert command(tmp_path, foreign.ply(), ".ply", "--axes", flag) == 2
+
+
+# -- glTF ----------------------------------------------------------------------------------------------------------------
+
+
+def by(generator: str) -> dict[str, Any]:
+    return {"asset": {"version": "2.0", "generator": generator}}
+
+
+@pytest.mark.parametrize(
+    ("generator", "plain", "axes"),
+    [("splat-transform 1.10.1", False, "RDF"), ("splat-transform 2.3.1", False, "FUR"), ("splat-transform 2.7.1", True, "FUR"),
+     ("splat-transform 3.7.0", True, "FUR"), ("another 1.0", True, "FUR")],
+)  # fmt: skip
+def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
+    generator: str, plain: bool, axes: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = read(foreign.glb(plain=plain, document=by(generator)), "a.glb")
+    assert np.allclose(cloud.means, world(PLACES, axes))
+    assert np.allclose(cloud.log_scales, [[row[f"scale_{c}"] for c in range(3)] for row in ROWS], atol=1e-5)
+    assert np.allclose(cloud.logits, [row["opacity"] for row in ROWS], atol=1e-5)
+    assert (generator in capsys.readouterr().err) is not plain
+
+
+def test_the_axes_of_a_program_that_disagrees_can_be_overridden() -> None:
+    content = foreign.glb(plain=False, document=by("splat-transform 1.10.1"))
+    assert np.allclose(read(content, "a.glb", "viewer").means, world(PLACES, "FUR"))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (foreign.glb(plain=False), r"opacity[\s\S]*between 0 and 1[\s\S]*logits"),
+        (foreign.glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
+        (foreign.glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
+        (foreign.glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
+        (foreign.glb(kind={"colorSpace": 3}), "colour space"),
+        (foreign.glb(kind={"kernel": "gabor"}), "ellipsoids"),
+        (foreign.glb(kind={"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}), "compressed"),
+        (foreign.glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}), "KHR_draco"),
+        (foreign.glb(document={"extensionsRequired": "all"}), "no list"),
+        (foreign.glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
+        (foreign.glb(view={"buffer": 1}), "outside the file"),
+        (foreign.glb(document={"buffers": [{"byteLength": 9, "uri": "a.bin"}]}), "outside the file"),
+    ],
+)
+def test_what_gltf_does_not_allow_or_cannot_be_read_is_refused(content: bytes, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read(content, "a.glb")
+
+
+@pytest.mark.parametrize(
+    ("space", "linear"), [("srgb_rec709_display", False), ("BT.709-sRGB", False), (None, False), ("lin_rec709_display", True), ("BT.709-linear", True)]
+)
+def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, linear: bool) -> None:
+    table = rows(f_dc_0=[-1.0, 0.0, 1.0], f_dc_1=[-0.5, 0.5, 1.5], f_dc_2=[0.25, -0.25, 0.75])
+    cloud = read(foreign.glb(table, kind={"colorSpace": space}), "a.glb")
+    for n, row in enumerate(table):
+        for c in range(3):
+            color = 0.5 + 0.28209479177387814 * row[f"f_dc_{c}"]
+            shown = (1.055 * color ** (1 / 2.4) - 0.055 if color > 0.0031308 else 12.92 * color) if linear else color
+            assert 0.5 + 0.28209479177387814 * float(cloud.sh[n, 0, c]) == pytest.approx(shown, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (foreign.glb(kind={"colorSpace": None}), "names no colorSpace"),
+        (foreign.glb(kind={"sortingMethod": "zDepth"}), "zDepth"),
+        (foreign.glb(kind={"projection": "orthographic"}), "orthographic"),
+        (foreign.glb(document={"animations": [{"channels": [], "samplers": []}]}), "animations"),
+        (foreign.glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
+        (foreign.glb(turn_length=3.0), "length 1"),
+        (foreign.glb(more="SH_DEGREE_4_COEF_0"), "degree 3"),
+        (foreign.glb(document={
+            "nodes": [{"mesh": 0}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}], "scenes": [{"nodes": [0, 1]}]}), "hides"),
+    ],
+)  # fmt: skip
+def test_what_a_glb_file_means_besides_is_said(content: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = read(content, "a.glb", "world")
+    assert said in capsys.readouterr().err.replace("\n", " ")
+    assert np.allclose(cloud.means, PLACES)
+
+
+# -- far away ------------------------------------------------------------------------------------------------------------
+
+UTM = np.array([500_123.0, 5_412_345.0, 210.0])
+ECEF = np.array([4_157_222.0, 664_789.0, 4_774_952.0])
+NEAR = np.array([[0.0, 0.0, 0.0], [0.0123, -0.0456, 0.0789], [3.0017, 1.0029, -2.0031]])
+
+
+def far_ply(offset: np.ndarray, kind: str = "double") -> bytes:
+    places = offset + NEAR
+    return foreign.ply(rows(**{name: places[:, n].tolist() for n, name in enumerate("xyz")}), kinds=dict.fromkeys("xyz", kind))
+
+
+@pytest.mark.parametrize("offset", [UTM, ECEF], ids=["UTM", "ECEF"])
+@pytest.mark.parametrize("given", [True, False])
+def test_an_offset_is_taken_away_before_places_are_rounded(
+    offset: np.ndarray, given: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--origin-m", *(f"{value}" for value in offset)] if given else []
+    assert command(tmp_path, far_ply(offset), ".ply", "--axes", "world", *flags) == 0
+    means = load_model(tmp_path / "out").table["means"].detach().numpy().astype(np.float64)
+    assert np.abs((means - means[0]) - NEAR).max() < 1e-5
+    if given:
+        assert np.abs(means - NEAR).max() < 1e-5
+    else:
+        assert np.abs(means).max() < 10 and "becomes the origin" in capsys.readouterr().err.replace("\n", " ")
+        summary = (tmp_path / "out" / "run.json").read_text()
+        assert f"{offset[0]:.1f}"[:6] in summary
+
+
+def test_an_offset_that_stays_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(tmp_path, far_ply(UTM), ".ply", "--axes", "world", "--origin-m", "0", "0", "0") == 0
+    assert "rounded to 500 mm" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "step"),
+    [
+        (far_ply(UTM, "float"), "a.ply", "500 mm"),
+        (foreign.compressed_ply(600_000, 600_010), "a.ply", "62.5 mm"),
+        (foreign.splat(rows(x=40_000.0)), "a.splat", "3.91 mm"),
+        (foreign.glb(rows(x=300_000.0)), "a.glb", "31.2 mm"),
+    ],
+)
+def test_places_that_were_rounded_in_the_file_are_said(content: bytes, name: str, step: str, capsys: pytest.CaptureFixture[str]) -> None:
+    read(content, name)
+    assert f"steps of {step}" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("node", "scale"),
+    [({"translation": UTM.tolist()}, 1), ({"matrix": [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, *UTM.tolist(), 1]}, 2),
+     ({"translation": UTM.tolist(), "scale": [0.5] * 3}, 0.5)],
+)  # fmt: skip
+def test_translations_of_nodes_are_added_in_double(node: dict[str, Any], scale: float, capsys: pytest.CaptureFixture[str]) -> None:
+    means = read(foreign.glb(node=node), "a.glb", "world").means
+    assert np.abs(means - UTM - scale * PLACES).max() < 1e-6
+    assert "steps" not in capsys.readouterr().err
+
+
+def test_bounds_of_chunks_in_double_keep_their_places() -> None:
+    means = read(foreign.compressed_ply(5_412_345.678, 5_412_346.678, "double"), "a.ply", "world").means
+    assert np.abs(means[:, 0] - [5_412_345.678, 5_412_346.678]).max() < 1e-6
+
+
+def test_a_far_object_keeps_its_shape(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(far_ply(UTM))
+    assert cli.main(["asset", "import", str(tmp_path / "a.ply"), "--axes", "world", "--out", str(tmp_path / "a.safetensors")]) == 0
+    means = read_asset(tmp_path / "a.safetensors").columns["means"].numpy()
+    assert np.abs((means - means[0]) - NEAR).max() < 1e-6
+
+
+def test_gaussians_far_out_in_a_scene_that_is_near_move_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A sky of Gaussians, 100 km away."""
+    table = [row for _ in range(20) for row in ROWS] + rows(x=1e5)[:1]
+    assert command(tmp_path, foreign.ply(table), ".ply", "--axes", "world") == 0
+    means = load_model(tmp_path / "out").table["means"].detach().numpy()
+    assert np.array_equal(means[:3], PLACES.astype(np.float32)) and "warning" not in capsys.readouterr().err
+
+
+def test_a_comment_on_an_offset_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    read(foreign.ply(head=["comment offset 500000 5400000 200"]))
+    assert "offset 500000 5400000 200" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "remedy"),
+    [("a.ksplat", b"\0\1" * 99, "splat-transform"), ("a.gltf", b'{"asset": {}}', "glb"), ("meta.json", b'{"version": 2}', ".sog"),
+     ("a.usdz", b"PK\3\4" + bytes(99), "ply, spz or glb"), ("a.usda", b"#usda 1.0", "ply, spz or glb"), ("a.ckpt", b"\x80\2" * 9, "PLY")],
+)  # fmt: skip
+def test_files_that_are_not_read_say_what_to_do(name: str, content: bytes, remedy: str) -> None:
+    with pytest.raises(InputError, match=rf"what to do: [\s\S]*{remedy}"):
+        read(content, name)
