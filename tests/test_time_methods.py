@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 import torch
 from fit_settings import fit_config
 from pretend_device import pretend_device
-from toy_world import camera, fused_cloud, truth, view_at, write_scene
+from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
@@ -23,7 +24,9 @@ from mudg.core import losses, metrics
 from mudg.core.hex_planes import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.cloudfile import write_fused
+from mudg.data.cloudfile import read_fused, write_fused
+from mudg.data.scene import read_scene
+from mudg.methods import METHODS, PUBLISHED
 from mudg.models.scene import densify, nodes
 from mudg.models.scene.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.models.scene.deformed import DeformationField, DeformedNode
@@ -34,9 +37,13 @@ from mudg.models.scene.initial import columns_from_points
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
 from mudg.models.scene.vibration import VibrationNode, average_velocity, born_later, moving_rows, starting_columns
-from mudg.stages import fit
+from mudg.stages import fit, fuse
+from mudg.stages.config import FuseConfig
 from mudg.stages.fitting import pvg
+from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.recipes import RECIPES
+from mudg.stages.radiance import loop as radiance_loop
+from mudg.stages.radiance import rays
 
 SIZE, FRAMES = (60, 40), 6
 OWN = {
@@ -45,17 +52,20 @@ OWN = {
     "pvg": {"tau", "log_beta", "velocity"},
     "s3gaussian": {"planes", "plane_network"},
 }
-BOX_FREE = [name for name, recipe in RECIPES.items() if not recipe.boxes]
+BOX_FREE = [name for name in RECIPES if not METHODS[name].boxes]
+MOVING = [name for name in RECIPES if name != "gs3d"]
+FITTED_ALONE = [name for name, row in METHODS.items() if row.made_by == "render" and not {"virtual", "repaired"} & {*row.supervision}]
+"""Methods that are fitted to recorded views and nothing else."""
+FITTED = {"gaussians", "nodes", "model", "field"}
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> dict[str, Path]:
-    """A scene with a moving car, the same without its track, and what fusing gives."""
+    """A scene with a moving car, and what fusing gives."""
     root = tmp_path_factory.mktemp("world")
     write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
-    write_scene(root / "untracked", frames=FRAMES, width=SIZE[0], height=SIZE[1], tracks=False)
     write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    return {name: root / name for name in ("scene", "untracked", "fuse")}
+    return {name: root / name for name in ("scene", "fuse")}
 
 
 @pytest.fixture(autouse=True)
@@ -300,6 +310,8 @@ def test_the_losses_of_s3gaussian_by_hand():
             plane.copy_(bent if axes in ((0, 1), (0, 3)) else torch.ones(3, 3, 1))
     space, time, flat = plane_smoothness(node)
     assert (space.item(), time.item(), flat.item()) == pytest.approx((4.0, 4.0, 2 / 3))
+    straight = HexPlaneNode.fresh([0, 0, 0, 0], [1, 1, 1, 1], PlaneSizes(1, 1, 2, 2, 2), 1)
+    assert [term.item() for term in plane_smoothness(straight)] == [0.0, 0.0, 0.0]
 
 
 # ---- Bezier curves ---------------------------------------------------------------------------------------------------
@@ -373,7 +385,7 @@ def test_an_object_on_curves_starts_where_its_box_is_and_moves_with_its_columns(
 # ---- fits ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("method", MOVING)
 def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, monkeypatch, method):
     reached: set[str] = set()
     adam_step = fit.adam_step
@@ -417,14 +429,89 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     assert fitted_bytes(fit.run(config, world["scene"], world["fuse"], tmp_path / "parts")) == fitted_bytes(whole)
 
 
-@pytest.mark.parametrize("method", BOX_FREE)
-def test_methods_without_boxes_do_not_read_them(world, tmp_path, method):
-    """Neither the tracks of the scene nor the clouds of its objects change a byte."""
-    fused = fused_cloud(FRAMES)
-    write_fused(tmp_path / "fuse", replace(fused, objects={}), {})
-    tracked = fit.run(settings(method), world["scene"], world["fuse"], tmp_path / "tracked")
-    untracked = fit.run(settings(method), world["untracked"], tmp_path / "fuse", tmp_path / "untracked")
-    assert fitted_bytes(tracked) == fitted_bytes(untracked)
+@pytest.fixture(scope="module")
+def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
+    """Scenes of two cameras, one darker, that differ in their tracks alone, each with what fusing makes of it."""
+    root = tmp_path_factory.mktemp("tracks")
+    for name, changes in {"tracked": {}, "untracked": {"tracks": False}, "garbled": {"garbled": True}}.items():
+        write_scene(root / name, frames=4, cameras=("front", "left"), width=SIZE[0], height=SIZE[1], dark=("left",), **changes)
+        fuse.run(FuseConfig(min_object_points=5, voxel_m=0.05), root / name, root / f"{name}-fuse")
+    return {path.name: path for path in root.iterdir()}
+
+
+def fitted_to(worlds: dict[str, Path], name: str, out: Path, method: str, iterations: int = 4) -> Path:
+    small = {"radiance__rays": 16, "radiance__lidar_rays": 16} if method == "emernerf" else {}
+    return fit.run(settings(method, iterations=iterations, **small), worlds[name], worlds[f"{name}-fuse"], out / name)
+
+
+def test_fusing_depends_on_tracks(tracked_or_not):
+    """Otherwise the next test proves nothing: points and colours of the three clouds differ."""
+    clouds = [read_fused(tracked_or_not[f"{name}-fuse"]) for name in ("tracked", "untracked", "garbled")]
+    assert len({len(cloud.static) for cloud in clouds}) == 3
+    assert [len(cloud.objects) for cloud in clouds] == [1, 0, 1]
+    assert clouds[1].colors.to_common["left"].gain != clouds[2].colors.to_common["left"].gain
+
+
+def test_the_page_says_which_methods_know_boxes():
+    page = (Path(__file__).parent.parent / "docs" / "baselines.md").read_text()
+    listed = dict(re.findall(r"^\| `(\w+)` \| (yes|no) \| [^|]+ \|$", page, re.MULTILINE))
+    assert listed == {name: "yes" if row.boxes else "no" for name, row in METHODS.items() if name in listed}
+    assert {"gs3d", "street_gaussians", *PUBLISHED} == set(listed)
+
+
+@pytest.mark.parametrize("method", FITTED_ALONE)
+def test_boxes_change_a_method_if_and_only_if_it_knows_them(tracked_or_not, tmp_path, method):
+    """Without boxes: no byte of the start and of the fit depends on the tracks of the scene, nor on the clouds that they cleaned."""
+    for iterations in (1, 4):
+        out = tmp_path / str(iterations)
+        folders = [fitted_to(tracked_or_not, name, out, method, iterations) for name in ("tracked", "untracked", "garbled")]
+        tracked, untracked, garbled = ({f.name: f.read_bytes() for f in folder.glob("*.*") if f.stem in FITTED} for folder in folders)
+        assert len(tracked) >= 2
+        assert (tracked == untracked == garbled) is not METHODS[method].boxes
+        assert (tracked != untracked != garbled) is METHODS[method].boxes
+
+
+@pytest.mark.parametrize("method", FITTED_ALONE)
+def test_a_method_learns_from_what_the_table_says_and_from_nothing_else(tracked_or_not, tmp_path, monkeypatch, method):
+    """Without the depths, the sky or the classes of recorded views another scene comes out if and only if the row names them."""
+    row, load = METHODS[method], fit_views.load_recorded
+    reader = rays if row.scene == "radiance" else fit
+
+    def fitted_without(field: str) -> dict[str, bytes]:
+        with monkeypatch.context() as patched:
+            patched.setattr(reader, "load_recorded", lambda *given: ((n, replace(view, **{field: None})) for n, view in load(*given)))
+            if (row.scene, field) == ("radiance", "lidar"):
+                patched.setattr(radiance_loop, "lidar_rays", lambda scene: None)
+            folder = fitted_to(tracked_or_not, "tracked", tmp_path / field, method, 6)
+        return {file.name: file.read_bytes() for file in folder.glob("*.safetensors") if file.stem in FITTED}
+
+    usual = fitted_without("depth")  # which recorded views never have
+    changed = {name for name, field in {"lidar": "lidar", "sky": "sky", "semantics": "channels"}.items() if fitted_without(field) != usual}
+    assert {"color", *changed} == set(row.supervision)
+    if row.scene == "gaussians":
+        model = fit.load_model(tmp_path / "depth" / "tracked")
+        assert (model.sky is not None, bool(model.node_names())) == ("sky" in row.nodes, "objects" in row.nodes)
+
+
+def test_a_static_scene_starts_with_what_moved(tracked_or_not, tmp_path):
+    """Points lie on the car wherever a sweep met it, and nowhere above the road it has not reached."""
+    model = fit.load_model(fitted_to(tracked_or_not, "tracked", tmp_path, "gs3d", 1))
+    means = model.table["means"].detach().double().numpy()
+
+    def on_car(time_s: float) -> int:
+        local = geometry.transform_points(geometry.invert(car_pose(time_s)), means)
+        return int(((np.abs(local) < CAR_SIZE / 2 + 0.05) & (local[:, 2:] > -0.5)).all(1).sum())
+
+    assert min(on_car(time_s) for time_s in (0.0, 0.3, 0.6)) > 5
+    assert on_car(2.4) == 0
+
+
+def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_not, tmp_path):
+    fuse.run(FuseConfig(voxel_m=0.8, match_colors=False), tracked_or_not["tracked"], tmp_path / "coarse")
+    scene = read_scene(tracked_or_not["tracked"])
+    fine, coarse = (fuse.fused_without_boxes(scene, folder) for folder in (tracked_or_not["tracked-fuse"], tmp_path / "coarse"))
+    assert len(coarse.static) < len(fine.static) / 2
+    assert (fine.colors.to_common.keys(), coarse.colors.to_common.keys()) == ({"left"}, set())
 
 
 @pytest.mark.parametrize("method", BOX_FREE)
@@ -447,7 +534,7 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", RECIPES)
+@pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
     small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch", "hexplane__space": 4}
     here = fit.run(settings(method, device="cpu", **small), world["scene"], world["fuse"], tmp_path / "here")

@@ -164,9 +164,10 @@ def sweep_points(time_s: float, beams: int = 24, columns: int = 240) -> tuple[np
 
 def write_scene(
     root: Path, *, frames: int = 8, cameras: tuple[str, ...] = ("front",), width: int = 96, height: int = 64,
-    labels: bool = True, tracks: bool = True,
+    labels: bool = True, tracks: bool = True, garbled: bool = False, dark: tuple[str, ...] = (),
 ) -> Scene:  # fmt: skip
-    """A scene directory of ``frames`` time steps, 0.3 s apart; frame 3, 7, ... of each camera are test frames."""
+    """A scene directory of ``frames`` time steps, 0.3 s apart; frame 3, 7, ... of each camera are test frames. ``garbled``: the car's
+    track is larger and elsewhere, across the houses on the left. ``dark``: cameras whose images are darker than those of others."""
     times = np.arange(frames) * 0.3
     yaws = {"front": 0.0, "left": 0.9, "right": -0.9}
     split = {}
@@ -176,7 +177,7 @@ def write_scene(
             writer.add_camera(cam)
             for index, time_s in enumerate(times):
                 seen = truth(view_at(float(time_s), cam, yaws[name]))
-                rgb = (seen.rgb * 255).round().byte().permute(1, 2, 0).numpy()
+                rgb = (seen.rgb * (140 if name in dark else 255)).round().byte().permute(1, 2, 0).numpy()
                 semantics = seen.semantics.numpy().astype(np.uint8)
                 given = {"semantics": semantics, "sky": semantics == ID["sky"]} if labels else {}
                 writer.add_frame(f"{name}/{index:06d}", seen.view, rgb, labels=given)
@@ -188,7 +189,10 @@ def write_scene(
             local = geometry.transform_points(geometry.invert(world_from_lidar), xyz).astype(np.float32)
             points = SweepPoints(local, np.full(len(local), 0.5, np.float32), np.zeros(len(local), np.float32))
             writer.add_sweep(f"lidar/{index:06d}", "lidar", float(time_s), world_from_lidar, points)
-        if tracks:
+        if garbled:
+            keys = np.stack([geometry.yaw_matrix(0.0, (10.0 + 4 * t, 7.0, 2.0)) for t in times])
+            writer.add_track(Track("car", "truck", np.array([9.0, 5.0, 4.0]), times, keys))
+        elif tracks:
             writer.add_track(Track("car", "car", CAR_SIZE, times, np.stack([car_pose(float(t)) for t in times])))
         writer.set_ego(EgoPath(times, np.stack([ego_pose(float(t)) for t in times])))
         writer.set_split(split)

@@ -20,6 +20,7 @@ class Method:
         nodes: what its scene consists of (objects: one rigid or deformable node per dynamic track); empty for a method without a scene.
         supervision: what its scene learns from; virtual: the views of mudg_r; repaired: its own renders beside the path, repaired.
         scene: what its scene is made of: Gaussians, or a radiance field that is marched along rays.
+        boxes: whether it knows the tracked boxes, those of the scene and those that fusing used.
     """
 
     title: str
@@ -27,18 +28,19 @@ class Method:
     nodes: tuple[Literal["static", "objects", "sky"], ...] = ()
     supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual", "repaired"], ...] = ()
     scene: Literal["gaussians", "radiance"] = "gaussians"
+    boxes: bool = True
 
 
 _STREET: Final = ("color", "semantics", "lidar", "sky")
 
 METHODS: Final[dict[str, Method]] = {
-    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics")),
+    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics"), boxes=False),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
-    "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET),
-    "s3gaussian": Method("S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar")),
+    "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET, boxes=False),
+    "s3gaussian": Method("S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar"), boxes=False),
     "bezier": Method("BezierGS", "render", ("static", "objects", "sky"), _STREET),
     "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET),
-    "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance"),
+    "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance", boxes=False),
     "difix": Method(
         "Difix3D scheme, our network, no last repair", "render", ("static", "objects", "sky"), (*_STREET, "repaired")
     ),

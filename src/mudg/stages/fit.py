@@ -85,6 +85,7 @@ from mudg.stages.fitting.views import (
     training_frames,
     virtual_sets,
 )
+from mudg.stages.fuse import fused_without_boxes
 from mudg.stages.radiance.loop import fit_radiance
 
 OUTPUT = VerbOutput(
@@ -149,7 +150,9 @@ def run(
         inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
     device = drawing_device(config.device, "fit", config.raster)
     check_drawing(config, device)
-    folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
+    # Clouds without boxes are fused again here; results of methods that took the one of `mudg fuse` are made again.
+    output = OUTPUT if METHODS[config.method].boxes else replace(OUTPUT, version=OUTPUT.version + 1)
+    folder = RunDir.open(out, output, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
     config = recipe_of(config.method).used(config)
@@ -223,7 +226,12 @@ class FitInputs:
 
 def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, fused, start = recipe_of(config.method).scene(read_scene(given.scene)), read_fused(given.fused), given.start
+    scene, start = read_scene(given.scene), given.start
+    if METHODS[config.method].boxes:
+        fused = read_fused(given.fused)
+    else:
+        scene = replace(scene, tracks=())
+        fused = fused_without_boxes(scene, given.fused)
     frames, invented = training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
     needed = recorded_bytes(frames, config.width_px) + virtual_bytes(given.virtual)
     scratch = scratch_folder(len(frames) + invented, needed, out)

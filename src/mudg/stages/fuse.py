@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
-from mudg.base.config import to_dict
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
@@ -61,21 +61,19 @@ def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) 
     refuse_overlap(out, {"scene": scene})
     loaded = read_scene(scene)
     refuse_without_lidar(loaded)
-    folder = RunDir.open(out, _OUTPUT, to_dict(config), {"scene": store.digest(scene)}, overwrite)
+    folder = RunDir.open(out, _OUTPUT, configuration.to_dict(config), {"scene": store.digest(scene)}, overwrite)
     if folder.complete:
         return folder.reused()
     for finding in check_distance(loaded):
         log.warn(f"fuse: {finding.message}")
-    rules = rules_of(config)
-    cameras = camera_colors(loaded, config, rules) if config.match_colors else SAME_COLORS
-    cloud, report = fuse_sweeps(scene_sweeps(loaded, config), loaded.tracks, rules, cameras)
+    cloud, report = fuse_scene(loaded, config)
     if report.sweeps and not len(cloud.static):
         log.warn(
             "fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`"
         )
-    for words in (*describe(report), *describe_colors(cameras)):
+    for words in (*describe(report), *describe_colors(cloud.colors)):
         log.info(f"fuse: {words}")
-    write_fused(folder.path, cloud, report_record(report, rules))
+    write_fused(folder.path, cloud, report_record(report, rules_of(config)))
     store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
     folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
     return folder.path
@@ -97,10 +95,26 @@ def run_many(
     return run_listed(ListedRun("fuse", config, entries, out, jobs, overwrite, shard, listed))
 
 
+def fuse_scene(scene: Scene, config: FuseConfig) -> tuple[FusedCloud, FusionReport]:
+    """The clouds of a scene, and what happened."""
+    rules = rules_of(config)
+    cameras = camera_colors(scene, config, rules) if config.match_colors else SAME_COLORS
+    return fuse_sweeps(scene_sweeps(scene, config), scene.tracks, rules, cameras)
+
+
+def fused_without_boxes(scene: Scene, folder: Path) -> FusedCloud:
+    """The cloud of a scene as if it had no tracks, with the settings of the clouds in ``folder``. Clouds of an edited run have none of
+    their own; then the usual ones."""
+    settings = folder / "run.yaml"
+    config = configuration.load(FuseConfig, None, settings if settings.is_file() else None)
+    log.info("fusing again, without tracked boxes")
+    return fuse_scene(dataclasses.replace(scene, tracks=()), config)[0]
+
+
 def rules_of(config: FuseConfig) -> FusionRules:
     """The fusion rules that a configuration asks for."""
     names = {field.name for field in dataclasses.fields(FusionRules)}
-    return FusionRules(**{name: value for name, value in to_dict(config).items() if name in names})
+    return FusionRules(**{name: value for name, value in configuration.to_dict(config).items() if name in names})
 
 
 def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:

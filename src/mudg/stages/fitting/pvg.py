@@ -41,7 +41,6 @@ FILLED_SPAN: Final = 1.2
 class VibrationRecipe(OwnRecipe):
     """See the module's text."""
 
-    boxes = False
     own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "sky_weight")
     unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
     last_densified: ClassVar[float] = 0.5
@@ -51,7 +50,7 @@ class VibrationRecipe(OwnRecipe):
     ) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
         node = VibrationNode.of_times([frame.view.time_s for frame in scene.frames])
-        found = timed_points(scene, views, classes, config, fused.colors, moments=True)
+        found = timed_points(scene, views, classes, config, fused.colors)
         duration = FRAME * (len({frame.view.time_s for frame in scene.frames}) - 1)
         drawn = (
             (seeds.numpy_rng(config.seed, 0, "start times").random(len(found.time_s)) - 0.5) * FILLED_SPAN * duration

@@ -49,10 +49,9 @@ class DrawnView:
 class Recipe:
     """A method that is the common loop and nothing else.
 
-    ``boxes``: whether it may know the tracked boxes. ``own_weights``: settings of ``loss`` that are its own, published ones.
+    ``own_weights``: settings of ``loss`` that are its own, published ones.
     """
 
-    boxes: ClassVar[bool] = True
     own_weights: ClassVar[tuple[str, ...]] = ()
     unfit: ClassVar[tuple[str, ...]] = ()
     """Settings, ``group.field``, that mean nothing to the method and must keep their defaults."""
@@ -69,10 +68,6 @@ class Recipe:
     def used(self, config: FitConfig) -> FitConfig:
         """The settings with those put in that the method fixes."""
         return config
-
-    def scene(self, scene: Scene) -> Scene:
-        """The scene as the method may know it."""
-        return scene if self.boxes else replace(scene, tracks=())
 
     def common(self, config: FitConfig) -> FitConfig:
         """The settings of the common loss terms: those that the method replaces weigh nothing."""
@@ -122,3 +117,9 @@ class OwnRecipe(Recipe):
 
 BOX_SETTINGS = ("poses.learn", "objects.deformable", "objects.mirror_start", "loss.object_weight")
 """Settings about dynamic objects, which methods without boxes do not know."""
+
+
+class StaticRecipe(OwnRecipe):
+    """``gs3d``: the common loop, without dynamic objects."""
+
+    unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS

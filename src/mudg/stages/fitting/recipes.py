@@ -9,10 +9,11 @@ from mudg.stages.fitting.bezier import BezierRecipe
 from mudg.stages.fitting.difix import RepairRecipe
 from mudg.stages.fitting.omnire import OmniRecipe
 from mudg.stages.fitting.pvg import VibrationRecipe
-from mudg.stages.fitting.recipe import Recipe
+from mudg.stages.fitting.recipe import Recipe, StaticRecipe
 from mudg.stages.fitting.s3gaussian import FieldRecipe
 
 RECIPES: Final[Mapping[str, Recipe]] = {
+    "gs3d": StaticRecipe(),
     "bezier": BezierRecipe(),
     "omnire": OmniRecipe(),
     "pvg": VibrationRecipe(),

@@ -44,7 +44,6 @@ BOX_MARGIN: Final = 0.02
 class FieldRecipe(OwnRecipe):
     """See the module's text."""
 
-    boxes = False
     own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "ssim_weight")
     unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
     last_densified: ClassVar[float] = 0.5
@@ -57,7 +56,7 @@ class FieldRecipe(OwnRecipe):
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
     ) -> SceneModel:
         """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
-        found = timed_points(scene, views, classes, config, fused.colors, moments=True)
+        found = timed_points(scene, views, classes, config, fused.colors)
         measured = found.points.xyz[~np.isnan(found.time_s)].astype(np.float64)
         low, high = measured.min(0), measured.max(0)
         margin = BOX_MARGIN * (high - low) + 0.1

@@ -48,13 +48,10 @@ def timed_points(
     classes: tuple[int, ...],
     config: FitConfig,
     colors: CameraColors,
-    moments: bool,
 ) -> TimedPoints:
     """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in ``start.py``).
 
-    Args:
-        moments: half of the points are one per cube of space and every few frames, so that what moves has points all along its way;
-            else all are one per cube.
+    Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all along its way.
 
     Raises:
         InputError: no photograph shows any LiDAR point.
@@ -64,14 +61,8 @@ def timed_points(
         raise InputError("no LiDAR point is seen by a training photograph of its time", where=scene.root,
                          remedy="check the LiDAR of the scene and --cameras")  # fmt: skip
     centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
-    half = (
-        replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
-        if moments
-        else config
-    )
-    parts = [thinned(xyz, centers, half)]
-    if moments:
-        parts += _by_moment(xyz, time_s, scene, half)
+    half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
+    parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]
     chosen = [
         (StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])), time_s[rows]) for rows in parts
     ]
