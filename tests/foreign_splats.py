@@ -104,8 +104,9 @@ def spz(
     return head + zone + toc + b"".join(frames)
 
 
-def sog(**fields: Any) -> bytes:
-    """Two solid Gaussians at (0, 0, 0) and (e - 1, ...) as a SOG file; ``fields`` are added to meta.json, ``a.b`` within ``a``."""
+def sog(lossy: str = "", **fields: Any) -> bytes:
+    """Two solid Gaussians at (0, 0, 0) and (e - 1, ...) as a SOG file; ``fields`` are added to meta.json, ``a.b`` within ``a``;
+    ``lossy``: the picture that is written with loss."""
     table = [-5.0 + 0.01 * n for n in range(256)]
     meta: dict[str, Any] = {
         "version": 2, "count": 2, "means": {"mins": [0.0] * 3, "maxs": [1.0] * 3, "files": ["l.png", "u.png"]},
@@ -123,7 +124,7 @@ def sog(**fields: Any) -> bytes:
             image, picture = Image.new("RGBA", (2, 1)), io.BytesIO()
             image.putpixel((0, 0), first)
             image.putpixel((1, 0), second)
-            image.save(picture, "PNG")
+            image.save(picture, "WEBP" if name == lossy else "PNG")
             archive.writestr(f"{name}.png", picture.getvalue())
     return target.getvalue()
 

@@ -131,6 +131,25 @@ def test_what_is_drawn_antialiased_is_exported_with_the_marks_of_each_format() -
     assert not any(formats.losses(name, formats.WriteRequest(scene, 0.0)) for name in written)
 
 
+@pytest.mark.parametrize("name", ["ply", "compressed-ply"])
+@pytest.mark.parametrize("choice", ["viewer", "world"])
+def test_a_ply_with_the_axes_of_this_program_says_so(name: str, choice: str) -> None:
+    cloud = toy_splats.cloud(5, 1)
+    scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", cloud),), formats.file_from_world(name, choice))
+    content = formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0))
+    assert (b"\ncomment Vertical Axis: z\n" in content) is (choice == "world")
+    nearest = np.abs(read(content).means[:, None] - cloud.means[None]).max(2).min(0)
+    assert nearest.max() < 0.05
+
+
+def test_parts_of_a_bundle_state_their_axes() -> None:
+    archive = zipfile.ZipFile(io.BytesIO(formats.FORMATS["bundle"].write(formats.WriteRequest(toy_splats.scene(), None))))
+    parts = [name for name in archive.namelist() if name.endswith(".ply")]
+    assert len(parts) == 3
+    for name, node in zip(parts, toy_splats.scene().nodes, strict=True):
+        assert np.allclose(read(archive.read(name)).means, node.cloud.means, atol=1e-6)
+
+
 def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.ply").write_bytes(MARKED["ply Brush"][0])
     assert cli.main(["asset", "import", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.safetensors")]) == 0
@@ -199,6 +218,13 @@ def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -
                           (foreign.compressed_ply(-9, 9), "c.ply")):  # fmt: skip
         read(content, name)
     assert "warning" not in capsys.readouterr().err
+
+
+def test_colours_of_another_space_and_pictures_with_loss_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    read(foreign.ply(after=("element color_space 1\nproperty uchar color_space", b"\1")))
+    assert "color_space is not read" in capsys.readouterr().err.replace("\n", " ")
+    read(foreign.sog(lossy="c"), "a.sog")
+    assert "with loss" in capsys.readouterr().err.replace("\n", " ")
 
 
 @pytest.mark.parametrize("column", ["opacity", "scale_1", "f_dc_0", "rot_2"])
