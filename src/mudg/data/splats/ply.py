@@ -146,7 +146,7 @@ def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> S
 
 
 def marks_of(antialias: bool, z_up: bool) -> list[str]:
-    """Comments that say what differs from the usual PLY of Gaussians: they are to be drawn antialiased; its axes are those of this program."""
+    """Comments on what differs from the usual PLY of Gaussians: they are to be drawn antialiased; the axes are those of this program."""
     return ["SplatRenderMode: mip"] * antialias + ["Vertical Axis: z"] * z_up
 
 
