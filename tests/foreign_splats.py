@@ -60,7 +60,8 @@ def ply(
 
 def compressed_ply(low: float, high: float, kind: str = "float", head: Iterable[str] = (), more: str = "") -> bytes:
     """Two Gaussians at both ends of a chunk that reaches from ``low`` to ``high`` metres on every axis."""
-    bounds = [f"{side}_{name}" for names in ("x y z", "scale_x scale_y scale_z", "r g b") for side in ("min", "max") for name in names.split()]
+    groups = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    bounds = [f"{side}_{name}" for names in groups for side in ("min", "max") for name in names]
     lines = ["ply", "format binary_little_endian 1.0", *head, "element chunk 1", *(f"property {kind} {name}" for name in bounds)]
     lines += ["element vertex 2", *(f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color"))]
     lines += [*([f"property uchar {more}"] if more else []), "end_header\n"]
@@ -104,8 +105,9 @@ def spz(
     return head + zone + toc + b"".join(frames)
 
 
-def sog(**fields: Any) -> bytes:
-    """Two solid Gaussians at (0, 0, 0) and (e - 1, ...) as a SOG file; ``fields`` are added to meta.json, ``a.b`` within ``a``."""
+def sog(lossy: str = "", **fields: Any) -> bytes:
+    """Two solid Gaussians at (0, 0, 0) and (e - 1, ...) as a SOG file; ``fields`` are added to meta.json, ``a.b`` within ``a``;
+    ``lossy``: the picture that is written with loss."""
     table = [-5.0 + 0.01 * n for n in range(256)]
     meta: dict[str, Any] = {
         "version": 2, "count": 2, "means": {"mins": [0.0] * 3, "maxs": [1.0] * 3, "files": ["l.png", "u.png"]},
@@ -123,14 +125,15 @@ def sog(**fields: Any) -> bytes:
             image, picture = Image.new("RGBA", (2, 1)), io.BytesIO()
             image.putpixel((0, 0), first)
             image.putpixel((1, 0), second)
-            image.save(picture, "PNG")
+            image.save(picture, "WEBP" if name == lossy else "PNG")
             archive.writestr(f"{name}.png", picture.getvalue())
     return target.getvalue()
 
 
 def glb(
-    table: Sequence[Mapping[str, float]] = ROWS, *, plain: bool = True, kind: Mapping[str, Any] | None = None, node: Mapping[str, Any] | None = None,
-    document: Mapping[str, Any] | None = None, view: Mapping[str, Any] | None = None, turn_length: float = 1.0, more: str = "",
+    table: Sequence[Mapping[str, float]] = ROWS, *, plain: bool = True, kind: Mapping[str, Any] | None = None,
+    node: Mapping[str, Any] | None = None, document: Mapping[str, Any] | None = None, view: Mapping[str, Any] | None = None,
+    turn_length: float = 1.0, more: str = "",
 ) -> bytes:  # fmt: skip
     """Gaussians as a GLB file. plain: opacities and sizes as the standard says, else logits and logarithms. kind: fields of the extension.
     node, document, view: further fields of the node, the document, the first buffer view. more: name of a further attribute."""

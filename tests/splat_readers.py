@@ -37,7 +37,7 @@ def sigmoid(x: float) -> float:
 
 def read_ply(content: bytes) -> list[Splat]:
     head, _, body = content.partition(b"end_header\n")
-    lines = head.decode().splitlines()
+    lines = [line for line in head.decode().splitlines() if not line.startswith("comment ")]
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     count = int(lines[2].removeprefix("element vertex "))
     names = [line.removeprefix("property float ") for line in lines[3:]]

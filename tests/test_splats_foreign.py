@@ -121,7 +121,8 @@ def test_an_imported_scene_is_drawn_as_its_file_says(name: str, tmp_path: Path) 
 
 def test_what_is_drawn_antialiased_is_exported_with_the_marks_of_each_format() -> None:
     scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", toy_splats.cloud(5)),), facts={"drawing": {"antialias": True}})
-    written = {name: formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0)) for name in ("ply", "compressed-ply", "spz", "sog", "glb")}
+    names = ("ply", "compressed-ply", "spz", "sog", "glb")
+    written = {name: formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0)) for name in names}
     for name in ("ply", "compressed-ply"):
         assert b"\ncomment SplatRenderMode: mip\n" in written[name].partition(b"end_header")[0]
     assert gzip.decompress(written["spz"])[14] == 1
@@ -129,6 +130,25 @@ def test_what_is_drawn_antialiased_is_exported_with_the_marks_of_each_format() -
     assert meta["antialias"] is True and meta["model"] == "antialiased"
     assert all(read(content, f"a.{name}").antialias for name, content in written.items())
     assert not any(formats.losses(name, formats.WriteRequest(scene, 0.0)) for name in written)
+
+
+@pytest.mark.parametrize("name", ["ply", "compressed-ply"])
+@pytest.mark.parametrize("choice", ["viewer", "world"])
+def test_a_ply_with_the_axes_of_this_program_says_so(name: str, choice: str) -> None:
+    cloud = toy_splats.cloud(5, 1)
+    scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", cloud),), formats.file_from_world(name, choice))
+    content = formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0))
+    assert (b"\ncomment Vertical Axis: z\n" in content) is (choice == "world")
+    nearest = np.abs(read(content).means[:, None] - cloud.means[None]).max(2).min(0)
+    assert nearest.max() < 0.05
+
+
+def test_parts_of_a_bundle_state_their_axes() -> None:
+    archive = zipfile.ZipFile(io.BytesIO(formats.FORMATS["bundle"].write(formats.WriteRequest(toy_splats.scene(), None))))
+    parts = [name for name in archive.namelist() if name.endswith(".ply")]
+    assert len(parts) == 3
+    for name, node in zip(parts, toy_splats.scene().nodes, strict=True):
+        assert np.allclose(read(archive.read(name)).means, node.cloud.means, atol=1e-6)
 
 
 def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -201,6 +221,13 @@ def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -
     assert "warning" not in capsys.readouterr().err
 
 
+def test_colours_of_another_space_and_pictures_with_loss_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    read(foreign.ply(after=("element color_space 1\nproperty uchar color_space", b"\1")))
+    assert "color_space is not read" in capsys.readouterr().err.replace("\n", " ")
+    read(foreign.sog(lossy="c"), "a.sog")
+    assert "with loss" in capsys.readouterr().err.replace("\n", " ")
+
+
 @pytest.mark.parametrize("column", ["opacity", "scale_1", "f_dc_0", "rot_2"])
 def test_whole_numbers_are_refused(column: str) -> None:
     with pytest.raises(InputError, match=rf"whole numbers[\s\S]*{column}"):
@@ -215,7 +242,7 @@ def test_a_splat_file_of_logarithms_says_what_to_do() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"rot_0": [1.0, 0.0, 1.0], "rot_1": 0.0, "rot_2": 0.0, "rot_3": 0.0}, r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out"),
+        ({f"rot_{n}": [1.0 - n, 0.0, 1.0] for n in range(4)}, r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out"),
         ({"scale_1": [0.0, 0.0, math.nan]}, r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
         ({"x": [math.inf, 0.0, 0.0]}, r"Gaussian 0[\s\S]*take them out"),
     ],
@@ -251,7 +278,8 @@ def test_other_elements_of_a_ply_are_passed_over(around: dict[str, Any], order: 
 
 def test_lists_before_the_gaussians_are_walked_over() -> None:
     lines = "element face 3\nproperty uchar flag\nproperty list ushort double weights\nproperty list uchar uchar more"
-    body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc" + b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
+    body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc"
+    body += b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
     assert np.array_equal(read(foreign.ply(before=(lines, body)), axes="world").means, PLACES)
 
 
@@ -343,7 +371,8 @@ def test_axes_of_spz_are_those_of_its_extension(code: int, version: int) -> None
     turn = np.array([UNIT[letter] for letter in axes]).T
     ways = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
     for n, row in enumerate(ROWS):
-        assert np.allclose(shape(cloud, n), turn @ covariance(row) @ turn.T, atol=0.1 * max(math.exp(2 * row[f"scale_{c}"]) for c in range(3)))
+        largest = max(math.exp(2 * row[f"scale_{c}"]) for c in range(3))
+        assert np.allclose(shape(cloud, n), turn @ covariance(row) @ turn.T, atol=0.1 * largest)
         dc, first = np.array([row[f"f_dc_{c}"] for c in range(3)]), np.array(F_REST).reshape(3, 3).T
         assert np.allclose(colors(cloud.sh[n, 0], cloud.sh[n, 1:4], ways), colors(dc, first, ways @ turn), atol=0.02)
 
@@ -462,7 +491,8 @@ def test_what_gltf_does_not_allow_or_cannot_be_read_is_refused(content: bytes, s
 
 
 @pytest.mark.parametrize(
-    ("space", "linear"), [("srgb_rec709_display", False), ("BT.709-sRGB", False), (None, False), ("lin_rec709_display", True), ("BT.709-linear", True)]
+    ("space", "linear"),
+    [("srgb_rec709_display", False), ("BT.709-sRGB", False), (None, False), ("lin_rec709_display", True), ("BT.709-linear", True)],
 )
 def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, linear: bool) -> None:
     table = rows(f_dc_0=[-1.0, 0.0, 1.0], f_dc_1=[-0.5, 0.5, 1.5], f_dc_2=[0.25, -0.25, 0.75])
@@ -485,7 +515,8 @@ def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, line
         (foreign.glb(turn_length=3.0), "length 1"),
         (foreign.glb(more="SH_DEGREE_4_COEF_0"), "degree 3"),
         (foreign.glb(document={
-            "nodes": [{"mesh": 0}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}], "scenes": [{"nodes": [0, 1]}]}), "hides"),
+            "nodes": [{"mesh": 0}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}],
+            "scenes": [{"nodes": [0, 1]}]}), "hides"),
     ],
 )  # fmt: skip
 def test_what_a_glb_file_means_besides_is_said(content: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -99,10 +99,11 @@ def containers(state):
         },
         "deepspeed": {"module": deep, "dp_world_size": 8, "mp_world_size": 1, "global_steps": 5, "ds_version": "0.9"},
         "plain": dict(state),
+        "compiled": {"state_dict": {"module._orig_mod." + name: value for name, value in state.items()}},
     }
 
 
-@pytest.mark.parametrize("kind", ["lightning", "deepspeed", "plain"])
+@pytest.mark.parametrize("kind", ["lightning", "deepspeed", "plain", "compiled"])
 def test_every_container_gives_the_same_tensors(tmp_path, complete, kind):
     some = {name: complete[name] for name in list(complete)[:20]}
     found = weights.read_checkpoint(saved(tmp_path, containers(some)[kind]))

@@ -238,7 +238,7 @@ INERT_MAPPINGS: dict[str, Any] = {
 }
 """The same for kinds of mappings, which are filled entry by entry."""
 
-_PREFIXES = ("_forward_module.", "module.")
+_PREFIXES = ("_forward_module.", "module.", "_orig_mod.")
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:

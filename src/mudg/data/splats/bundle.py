@@ -37,10 +37,11 @@ def to_bytes(scene: SplatScene, log: Scene | None = None) -> bytes:
     names = file_names([node.name for node in scene.nodes])
     files: dict[str, bytes] = {}
     listed: list[dict[str, Any]] = []
+    antialias = bool(scene.facts.get("drawing", {}).get("antialias", False))
     for name, node in zip(names, scene.nodes):
         place = f"objects/{name}.ply" if node.moves else ("static.ply" if node is scene.nodes[0] else f"{name}.ply")
         cloud = node.cloud if node.moves else node.cloud.moved(scene.file_from_world)
-        files[place] = ply.to_bytes(cloud, classes=True)
+        files[place] = ply.to_bytes(cloud, classes=True, marks=ply.marks_of(antialias, z_up=True))
         entry = {"name": node.name, "file": place, "gaussians": len(cloud), "degree": cloud.degree, "moves": node.moves}
         if node.displacement is not None:
             entry["deform"] = f"deform/{name}.safetensors"

@@ -10,6 +10,7 @@ in order, 10 bits each, ``v / sqrt 2 + 0.5``. Colour: 8 bits each of the colour 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -32,8 +33,8 @@ _LOG_RANGE: Final = 20.0
 Array = NDArray[np.float64]
 
 
-def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
-    """A cloud as a compressed PLY file; rows are brought into Morton order. ``antialias``: it is to be drawn so."""
+def to_bytes(cloud: SplatCloud, marks: Sequence[str] = ()) -> bytes:
+    """A cloud as a compressed PLY file; rows are brought into Morton order. ``marks``: comments, as in ``ply.marks_of``."""
     cloud = cloud.take(binary.morton_order(cloud.means))
     chunks = -(-len(cloud) // CHUNK)
     of_chunk = np.arange(len(cloud)) // CHUNK
@@ -64,7 +65,7 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
         rest = ply.channel_major(cloud.sh)
         elements.append(("sh", len(cloud), [("uchar", f"f_rest_{index}") for index in range(rest.shape[1])]))
         tables.append(np.trunc((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).tobytes())
-    return ply.header(elements, antialias) + b"".join(tables)
+    return ply.header(elements, marks) + b"".join(tables)
 
 
 def is_compressed(content: bytes) -> bool:

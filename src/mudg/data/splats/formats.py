@@ -48,6 +48,11 @@ class WriteRequest:
         """Whether the fit draws antialiased."""
         return bool(self.drawing.get("antialias", False))
 
+    @property
+    def marks(self) -> list[str]:
+        """Comments of a PLY file."""
+        return ply.marks_of(self.antialias, z_up=np.array_equal(self.scene.file_from_world, np.eye(4)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplatFormat:
@@ -67,10 +72,10 @@ class SplatFormat:
 
 
 FORMATS: Final[Mapping[str, SplatFormat]] = {
-    "ply": SplatFormat((".ply",), "RDF", lambda r: ply.to_bytes(r.cloud, classes=True, antialias=r.antialias),
+    "ply": SplatFormat((".ply",), "RDF", lambda r: ply.to_bytes(r.cloud, classes=True, marks=r.marks),
                        ply.from_bytes, frozenset({"harmonics", "classes", "antialias"})),
     "bundle": SplatFormat((".zip",), axes.WORLD, lambda r: bundle.to_bytes(r.scene, r.log), None,
-                          frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
+                          frozenset({"harmonics", "motion", "deformation", "classes", "sky", "antialias"})),
     "spz": SplatFormat((".spz",), "RUB", lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
                        spz.from_bytes, frozenset({"harmonics", "antialias"})),
     "glb": SplatFormat((".glb",), "FUR", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf_read.from_bytes,
@@ -81,7 +86,7 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
                         frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
     "alpasim": SplatFormat((".usdz",), axes.WORLD, lambda r: alpasim.to_package(r.scene, r.log, r.ground), None,
                            frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "RDF", lambda r: compressed_ply.to_bytes(r.cloud, r.antialias),
+    "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "RDF", lambda r: compressed_ply.to_bytes(r.cloud, r.marks),
                                   compressed_ply.from_bytes, frozenset({"harmonics", "antialias"})),
     "sog": SplatFormat((".sog",), "RDF", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
                        frozenset({"harmonics", "antialias"})),

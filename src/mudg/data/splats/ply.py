@@ -9,13 +9,14 @@ Read besides: files without ``scale_2`` (2DGS: flat), ``filter_3D`` (Mip-Splatti
 belongs to size and opacity), elements and lists of others, and what comments say of drawing and axes:
 
     comment SplatRenderMode: mip      (Brush, gsplat; also written here)      comment antialiased 1 (Postshot)
-    comment Vertical Axis: z          (nerfstudio)
+    comment Vertical Axis: z          (nerfstudio; also written here, where a file has the axes of this program)
 """
 
 from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -33,7 +34,7 @@ MOST_LISTS: Final = 2_000_000
 """Rows of lists that are walked over to reach Gaussians behind them: seconds."""
 FLAT_LOG: Final = float(np.log(1e-6))
 """Thickness of flat Gaussians, whose files state none."""
-_MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "standard": False}
+_MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
 _MOTION: Final = ("trbf", "motion", "omega", "t_", "time", "scale_t", "scaling_t", "rot_r", "rotation_r", "velocity", "duration")
 """Beginnings of columns with which methods for moving scenes move their Gaussians."""
 _TYPES: Final = {
@@ -45,8 +46,8 @@ _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3}
 """Number of ``f_rest`` columns: degree."""
 
 
-def to_bytes(cloud: SplatCloud, *, classes: bool = False, antialias: bool = False) -> bytes:
-    """A cloud as a PLY file; ``classes`` adds the column of our own, ``antialias`` the mark that it is drawn so."""
+def to_bytes(cloud: SplatCloud, *, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
+    """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
     with_classes = classes and cloud.class_ids is not None
     columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh), cloud.logits[:, None],
                cloud.log_scales, cloud.quats]  # fmt: skip
@@ -54,7 +55,7 @@ def to_bytes(cloud: SplatCloud, *, classes: bool = False, antialias: bool = Fals
         columns.append(cloud.class_ids[:, None])
     rows = np.concatenate([column.astype("<f4") for column in columns], 1)
     names = [*_names(cloud.degree), *(["class"] if with_classes else [])]
-    return header([("vertex", len(cloud), [("float", name) for name in names])], antialias) + rows.tobytes()
+    return header([("vertex", len(cloud), [("float", name) for name in names])], marks) + rows.tobytes()
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
@@ -144,9 +145,14 @@ def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> S
 # -- headers -------------------------------------------------------------------------------------------------------------
 
 
-def header(elements: list[tuple[str, int, list[tuple[str, str]]]], antialias: bool = False) -> bytes:
+def marks_of(antialias: bool, z_up: bool) -> list[str]:
+    """Comments on what differs from the usual PLY of Gaussians: they are to be drawn antialiased; the axes are those of this program."""
+    return ["SplatRenderMode: mip"] * antialias + ["Vertical Axis: z"] * z_up
+
+
+def header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: Sequence[str] = ()) -> bytes:
     """The header of a PLY file: elements with their number of rows and their properties (type, name)."""
-    lines = ["ply", "format binary_little_endian 1.0", *(["comment SplatRenderMode: mip"] if antialias else [])]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     for name, count, properties in elements:
         lines += [f"element {name} {count}", *(f"property {kind} {column}" for kind, column in properties)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode()
@@ -205,6 +211,9 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
     antialias = _antialias(comments, warnings)
     axes, by = _axes(comments, warnings)
     offset = next((line for line in comments if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line)), "")
+    colors = [name for name in more if "color" in name.lower()]
+    if colors:  # of apple/ml-sharp, for example
+        warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
     if offset:
         warnings.append(f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)")
     return PlyFile(tables, antialias, axes, by, tuple(notes), tuple(warnings))

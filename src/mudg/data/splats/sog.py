@@ -233,9 +233,10 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     cloud = checked(SplatCloud(means, *columns, logit(first[:, 3] / 255.0), sh.astype(np.float32), None, antialias), where)
     unknown = meta.unknown()
     notes = (f"fields of meta.json passed over: {binary.listed(unknown)}",) if unknown else ()
-    if meta.model in _MODELS:
-        return SplatFile(cloud, notes=notes)
-    return SplatFile(cloud, notes=notes, warnings=(f"its model {str(meta.model)[:40]!r} is not known: drawn as usual",))
+    warnings = [] if meta.model in _MODELS else [f"its model {str(meta.model)[:40]!r} is not known: drawn as usual"]
+    if pixels.lossy:
+        warnings.append("its pictures are compressed with loss, so that values are wrong: write them without")
+    return SplatFile(cloud, notes=notes, warnings=tuple(warnings))
 
 
 def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:
@@ -256,6 +257,7 @@ class _Pictures:
 
     def __init__(self, archive: binary.BoundedZip, folder: str, count: int, where: str) -> None:
         self._archive, self._folder, self._count, self._where = archive, folder, count, where
+        self.lossy = False
 
     def rows(self, name: str) -> Picture:
         """The pixels of the Gaussians, u8[count, 4]."""
@@ -269,6 +271,7 @@ class _Pictures:
             with Image.open(io.BytesIO(content), formats=["WEBP", "PNG"]) as image:
                 width, height = image.size
                 self._refuse_size(width, height, size, where)
+                self.lossy |= _lossy(content)
                 return np.asarray(image.convert("RGBA"))
         except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise InputError("a picture of the SOG file is damaged", where=where, got=str(error)[:120]) from error
@@ -286,3 +289,14 @@ class _Pictures:
                 expected=wanted,
                 got=f"{width}x{height}",
             )
+
+
+def _lossy(content: bytes) -> bool:
+    """Whether a picture is a WebP of the kind that loses values: a chunk ``VP8 `` in place of ``VP8L``."""
+    place = 12
+    while content[:4] == b"RIFF" and place + 8 <= len(content):
+        kind, size = content[place : place + 4], int.from_bytes(content[place + 4 : place + 8], "little")
+        if kind in (b"VP8 ", b"VP8L"):
+            return kind == b"VP8 "
+        place += 8 + size + size % 2
+    return False

@@ -163,7 +163,7 @@ def _extensions(content: bytes, where: str) -> dict[int, bytes]:
 
 def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], where: str) -> SplatFile:
     """The Gaussians with what header and extensions say about them."""
-    warnings, axes = list[str](), ""
+    notes, warnings, axes = list[str](), list[str](), ""
     if _AXES in extensions:
         code = int.from_bytes(extensions[_AXES], "little")
         if len(extensions[_AXES]) != 4 or code >= len(_AXES_CODES):
@@ -174,6 +174,8 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
     elif head.version == 4:
         warnings.append("it does not state its axes: read with y up, as the format says; splat-transform from 3 on writes y down: if it "
                         "stands on its head, add --axes RDF")  # fmt: skip
+    else:
+        notes.append("it does not state its axes: read with y up, as the format says; if it stands on its head, add --axes RDF")
     unknown = [f"{kind:#010x} ({len(part)} bytes)" for kind, part in extensions.items() if kind != _AXES and kind not in _HARMLESS]
     if unknown:
         warnings.append(f"extensions that are not known were passed over: {binary.listed(unknown)}")
@@ -183,7 +185,7 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
         warnings.append("harmonics beyond degree 3 were dropped")
     cloud = _cloud(planes, head, where)
     step = spacing_m(cloud.means, np.float16) if head.version == 1 else 2.0**-head.bits
-    return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, (), tuple(warnings))
+    return SplatFile(cloud, axes, f"extension {_AXES:#010x}", step, tuple(notes), tuple(warnings))
 
 
 def _zstandard(done: str) -> Any:
