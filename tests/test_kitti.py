@@ -292,3 +292,65 @@ def test_real_object_frame_points_and_box_counts(shared_data: Callable[[str], Pa
     for track, expected in zip(scene.tracks, counts, strict=True):
         local = geometry.transform_points(invert(track.world_from_object[0]), points)
         assert (np.abs(local) <= track.size_m / 2).all(1).sum() == pytest.approx(expected, rel=0.08)
+
+
+# --- empty lines ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frames", [None, (0, 12)])
+@pytest.mark.parametrize("stream", ["velodyne_points", "oxts", "image_02"])
+def test_an_empty_line_is_a_missing_time_and_moves_nothing(stream: str, frames: tuple[int, int] | None, tmp_path: Path) -> None:
+    """Drive 0009 of 2011_09_26 lacks four scans, and the file of their times has empty lines for them."""
+    folder = made.write_raw_drive(tmp_path / "day", made.Drive(tuple(range(14))))
+    suffix = {"velodyne_points": "bin", "oxts": "txt", "image_02": "png"}[stream]
+    for number in (4, 5):
+        (folder / stream / "data" / f"{number:010d}.{suffix}").unlink()
+    path = folder / stream / "timestamps.txt"
+    path.write_text("\n".join("" if n in (4, 5) else line for n, line in enumerate(path.read_text().splitlines())) + "\n")
+    scene = ingest(folder, tmp_path / "out", skip_missing=True, frames=frames)
+    numbers = [n for n in range(*(frames or (0, 14))) if stream == "oxts" or n not in (4, 5)]
+    first = invert(made.world_from_imu(0.0))
+    assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx([0.1 * n for n in numbers])
+    assert [frame.view.time_s for frame in scene.frames] == pytest.approx([0.1 * n for n in numbers])
+    for number, sweep in zip(numbers, scene.sweeps, strict=True):
+        exact = first @ made.world_from_velo(0.1 * number)
+        assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < (0.03 if stream == "oxts" else 1e-5)
+    pictures = [int(read_image(scene, frame)[0, 0, 2]) for frame in scene.frames]
+    assert pictures == [20 * n % 256 for n in numbers]
+
+
+def test_a_time_that_is_missing_for_a_recorded_file_is_named(tmp_path: Path) -> None:
+    folder = made.write_raw_drive(tmp_path / "day")
+    path = folder / "image_02" / "timestamps.txt"
+    path.write_text("\n".join("" if n == 2 else line for n, line in enumerate(path.read_text().splitlines())) + "\n")
+    with pytest.raises(InputError, match="timestamps of front lacks 2"):
+        ingest(folder, tmp_path / "refused")
+    scene = ingest(folder, tmp_path / "out", skip_missing=True)
+    assert [sweep.time_s for sweep in scene.sweeps] == pytest.approx([0.0, 0.1, 0.3, 0.4, 0.5])
+
+
+def test_an_empty_line_of_a_pose_file_is_a_missing_pose(tmp_path: Path) -> None:
+    """Line k is frame k: what lies behind the empty line stays where it was."""
+    folder = made.write_odometry(tmp_path, made.Drive(tuple(range(8))))
+    path = tmp_path / "poses" / "07.txt"
+    path.write_text("\n".join("" if n == 3 else line for n, line in enumerate(path.read_text().splitlines())) + "\n")
+    with pytest.raises(InputError, match="pose file lacks frames"):
+        ingest(folder, tmp_path / "refused")
+    scene = ingest(folder, tmp_path / "out", skip_missing=True)
+    first = invert(made.world_from_velo(0.0))
+    for sweep in scene.sweeps:
+        exact = first @ made.world_from_velo(sweep.time_s)
+        assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < 0.03  # frame 3 lies between its neighbours: 1.6 m of the arc
+    at_gap = [round(sweep.time_s, 6) for sweep in scene.sweeps]
+    assert at_gap == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
+
+
+def test_an_empty_line_of_a_packet_file_is_a_missing_packet(tmp_path: Path) -> None:
+    folder = made.write_tracking(tmp_path, drive=made.Drive(tuple(range(8))))
+    path = folder / "oxts" / "0003.txt"
+    path.write_text("\n".join("" if n == 3 else line for n, line in enumerate(path.read_text().splitlines())) + "\n")
+    scene = ingest(folder, tmp_path / "out", sequence="0003", skip_missing=True)
+    first = invert(made.world_from_imu(0.0))
+    for sweep in scene.sweeps:
+        exact = first @ made.world_from_velo(sweep.time_s)
+        assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < 0.03

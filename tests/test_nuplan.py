@@ -293,3 +293,67 @@ def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
     scene = ingest(source, tmp_path / "out", frames=(0, 2))
     assert {track.label for track in scene.tracks} == {"hover_board"}
     assert any("Hover Board" in note for note in scene.source.notes)
+
+
+# --- values of other types --------------------------------------------------------------------------------------------
+
+COLUMNS = (
+    "log.logfile", "ego_pose.token", "ego_pose.timestamp", "ego_pose.x", "ego_pose.qw", "camera.token", "camera.channel",
+    "camera.translation", "camera.intrinsic", "camera.distortion", "camera.width", "image.camera_token", "image.filename_jpg",
+    "image.timestamp", "lidar.token", "lidar.channel", "lidar.rotation", "lidar_pc.token", "lidar_pc.lidar_token", "lidar_pc.ego_pose_token",
+    "lidar_pc.filename", "lidar_pc.timestamp", "lidar_box.track_token", "lidar_box.yaw", "lidar_box.width", "track.token",
+    "track.category_token", "category.name", "scene.name",
+)  # fmt: skip
+VALUES = ("6000000000", "-1", "1.5", "NULL", "'text'", "''", "x'00ff'", "zeroblob(3000000)", "zeroblob(500000)", "9e999")
+
+
+def without_types(database: Path, table: str) -> sqlite3.Connection:
+    """The database with a table whose columns take values of any type."""
+    connection = sqlite3.connect(database)
+    for question in (f"CREATE TABLE other AS SELECT * FROM {table}", f"DROP TABLE {table}", f"ALTER TABLE other RENAME TO {table}"):
+        connection.execute(question)
+    return connection
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_values_of_other_types_are_refused_in_words(column: str, source: Path, tmp_path: Path) -> None:
+    import resource
+
+    table, _, name = column.partition(".")
+    connection = without_types(log(source), table)
+    row, kept = connection.execute(f"SELECT rowid, {name} FROM {table} LIMIT 1").fetchone()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for number, value in enumerate(VALUES):
+        connection.execute(f"UPDATE {table} SET {name} = {value} WHERE rowid = ?", (row,))
+        connection.commit()
+        try:
+            ingest(log(source), tmp_path / f"out {number}", sequence="scene-0000" if column == "scene.name" else "")
+        except (InputError, UsageError) as error:
+            assert len(str(error)) < 2500
+    connection.execute(f"UPDATE {table} SET {name} = ? WHERE rowid = ?", (kept, row))
+    connection.close()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+def test_doubled_image_rows_are_refused(source: Path, tmp_path: Path) -> None:
+    connection = without_types(log(source), "image")
+    connection.execute("INSERT INTO image SELECT * FROM image WHERE rowid = 2")
+    connection.commit()
+    connection.close()
+    with pytest.raises(InputError, match="two images of one camera have the same time") as caught:
+        ingest(log(source), tmp_path / "out")
+    assert "image at" in caught.value.where
+
+
+def test_long_names_are_refused_whichever_table_holds_them(source: Path, tmp_path: Path) -> None:
+    for table, column in (("category", "name"), ("camera", "channel"), ("log", "logfile")):
+        connection = sqlite3.connect(log(source))
+        kept = connection.execute(f"SELECT {column} FROM {table} LIMIT 1").fetchone()
+        connection.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = 1", ("n" * 201,))
+        connection.commit()
+        with pytest.raises(InputError, match="name is too long") as caught:
+            ingest(log(source), tmp_path / "out")
+        assert table in caught.value.where
+        connection.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = 1", kept)
+        connection.commit()
+        connection.close()
