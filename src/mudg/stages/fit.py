@@ -226,12 +226,9 @@ class FitInputs:
 
 def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, start = read_scene(given.scene), given.start
-    if METHODS[config.method].boxes:
-        fused = read_fused(given.fused)
-    else:
-        scene = replace(scene, tracks=())
-        fused = fused_without_boxes(scene, given.fused)
+    scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
+    if not METHODS[config.method].boxes:
+        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, given.fused)
     frames, invented = training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
     needed = recorded_bytes(frames, config.width_px) + virtual_bytes(given.virtual)
     scratch = scratch_folder(len(frames) + invented, needed, out)
