@@ -97,13 +97,13 @@ def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
 
 
 def refuse_unfit(
-    config: BenchConfig, preset: PresetName, fits: Sequence[FitConfig], generators: Sequence[SynthesizeConfig], renders: bool
+    config: BenchConfig, preset: PresetName, *, fits: Sequence[FitConfig], generators: Sequence[SynthesizeConfig], renders: bool
 ) -> None:
     """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use.
 
     Args:
-        fits: of all rows that fit a scene. generators: settings behind all views that are generated for a row itself. renders: whether
-            the diffusion model sees renders of the first fit.
+        preset: what the configuration started from. fits: of all rows that fit a scene. generators: settings behind all views that are
+            generated for a row itself. renders: whether the diffusion model sees renders of the first fit.
 
     Raises:
         UsageError: a setting that no row uses, weights that are asked for and not given, or a method that the model cannot serve.

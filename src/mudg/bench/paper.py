@@ -136,7 +136,7 @@ def run(
     generators = [
         replace(generator_of(config), **row.changes) for row in counted if METHODS[row.method].made_by == "synthesize"
     ]
-    refuse_unfit(config, preset, fits, generators, renders)
+    refuse_unfit(config, preset, fits=fits, generators=generators, renders=renders)
     jobs = [PaperJob(log, out / log.name, table, rows, config, preset, of_log(measured, log.name), renders, overwrite) for log in logs]
     found = each_log(make_log, jobs, [log.name for log in logs], at_once(config))
     settings = {

@@ -183,7 +183,8 @@ def run(
     _refuse_foreign(Path(out))
     generates = any(row.sees and not row.fit for row in rows)
     renders = mdm_files.uses_renders(config.model)
-    refuse_unfit(config, preset, [row.settings for row in rows if row.settings], [generator_of(config)] * generates, renders)
+    fits = [row.settings for row in rows if row.settings is not None]
+    refuse_unfit(config, preset, fits=fits, generators=[generator_of(config)] * generates, renders=renders)
     training = replace(adaptation or AdaptConfig(), model=config.model, processes=1, seed=config.seed)
     if renders:  # no other model is adapted
         training = replace(training, precision=config.precision)

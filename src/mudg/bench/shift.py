@@ -135,7 +135,8 @@ def run(
     painted = replace(generator_of(config), cameras=("front",), shifts_m=shifts)
     renders = mdm_files.uses_renders(config.model)
     generates = any(row.name == DIFFUSION for row in rows)
-    refuse_unfit(config, preset, [row.fit for row in rows if row.fit is not None], [painted] * generates, renders)
+    fits = [row.fit for row in rows if row.fit is not None]
+    refuse_unfit(config, preset, fits=fits, generators=[painted] * generates, renders=renders)
     jobs = [
         LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, config, painted, renders, overwrite) for seed in seeds
     ]
