@@ -38,6 +38,7 @@ SOURCES = {
     "pickled": lambda text: pickle.loads(pickle.dumps(InputError("bad", got=text, remedy=text))),
     "a record": lambda text: _raised(lambda: parse_record(Named, {"name": text}, f"{text}: ")),
     "an unknown field": lambda text: _raised(lambda: parse_record(Named, {text: 1}, "file: ")),
+    "a key that is no text": lambda text: _raised(lambda: parse_record(Named, {1: text, None: text, (text,): 1}, f"{text}: ")),
     "a missing field": lambda text: _raised(lambda: parse_record(Named, dict.fromkeys([f"{text}{n}" for n in range(9)]), "file: ")),
     "an edit": lambda text: _raised(lambda: parse_edits(json.dumps([{text[:9999]: {}}]), "file")),
     "a field of an edit": lambda text: _raised(lambda: parse_edits(json.dumps([{"move": {text[:9999]: 1, "id": text[:9999]}}]), "file")),

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
+from mudg.base import failures
 from mudg.base.errors import InputError, MudgError, nearest, short
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -24,6 +25,7 @@ Value = TypeVar("Value")
 RecordType = TypeVar("RecordType", bound="StrictRecord")
 ErrorType = TypeVar("ErrorType", bound=MudgError)
 
+_LARGEST_SIZE: Final = 65_536
 _MEANINGS: Final = {
     "float_type": ("value is not a number", "a number"),
     "finite_number": ("value is not finite", "a finite number"),
@@ -131,14 +133,24 @@ def parse_dataclass(kind: type[Value], values: object, where: str) -> Value:
         where: as in ``parse_record``.
 
     Raises:
-        InputError: the first field that is missing, unknown, or of a wrong type or range.
+        InputError: the first field that is missing, unknown, or of a wrong type or range; sizes end at 65,536, since what they shape is
+            built before it is compared with the weights.
     """
+    _refuse_sizes(values, where)
     try:
         made = TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
         raise first_problem(error, where) from error
     _compare_fields(values, dataclasses.asdict(made), where)  # type: ignore[call-overload]
     return made
+
+
+def _refuse_sizes(values: object, where: str) -> None:
+    parts = values.items() if isinstance(values, Mapping) else enumerate(values) if isinstance(values, list) else ()
+    for name, value in parts:
+        if isinstance(value, int) and abs(value) > _LARGEST_SIZE:
+            raise InputError("a size is too large", where=place(where, name), expected=f"at most {_LARGEST_SIZE}", got=str(value))
+        _refuse_sizes(value, place(where, name))
 
 
 def _compare_fields(stated: Any, complete: Mapping[str, Any], where: str) -> None:
@@ -182,6 +194,22 @@ def place(where: str, *steps: str | int) -> str:
         else:
             where += step if not where or where.endswith(": ") or step.startswith("[") else f".{step}"
     return where.removesuffix(": ")
+
+
+@contextlib.contextmanager
+def understood(what: str, where: str) -> Iterator[None]:
+    """InputError where a block that takes the content of files apart misses parts, or where they are of other types or do not fit.
+
+    Args:
+        what: what the files should hold, as in "a fitted scene".
+    """
+    try:
+        yield
+    except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
+        if failures.in_words(error) is not None:  # want of memory
+            raise
+        raise InputError(f"this cannot be read as {what}: parts are missing, or do not fit", where=where,
+            got=f"{type(error).__name__}: {error}", remedy="make it again, or take an undamaged copy") from error  # fmt: skip
 
 
 @contextlib.contextmanager

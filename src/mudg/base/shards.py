@@ -62,13 +62,19 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise InputError("not a valid safetensors file", where=str(path), got=str(error)) from error
 
 
-def read_shards(folder: Path, files: Mapping[str, str], *, remedy: str = "make the model again") -> dict[str, Tensor]:
+def read_shards(folder: Path, files: object, *, remedy: str = "make the model again") -> dict[str, Tensor]:
     """The tensors of files written by `write_shards`, checked against their sha256.
 
+    Args:
+        files: what a description says: names of files -> sha256.
+
     Raises:
-        IntegrityError: a file is missing or altered; `remedy` says what to do then.
+        InputError: `files` are no such names. IntegrityError: a file is missing or altered; `remedy` says what to do then.
     """
     tensors: dict[str, Tensor] = {}
+    if not isinstance(files, Mapping) or not all(isinstance(digest, str) for digest in files.values()):
+        raise InputError("the description of a model does not name its weight files", where=str(folder), expected="files: {NAME: SHA256}",
+            got=str(files), remedy=remedy)  # fmt: skip
     for name, digest in files.items():
         path = folder / Path(name).name
         if not path.is_file() or store.sha256_file(path) != digest:

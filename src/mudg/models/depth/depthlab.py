@@ -172,7 +172,8 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError("the description of a DepthLab model is not whole", where=str(where), got=repr(error)[:200],
             remedy="convert the published files again") from error  # fmt: skip
-    made = blank_parts(configs)
+    with records.understood("a DepthLab model", str(where)):
+        made = blank_parts(configs)
     for name, network in made.items():
         state = shards.read_shards(folder / name, files[name], remedy="convert the published files again")
         shards.check_fit(state, network.state_dict(), folder / name)

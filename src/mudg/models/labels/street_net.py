@@ -138,9 +138,9 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
     content = store.parse_json(store.read_bytes(where), str(where))
     if not isinstance(content, dict) or content.get("schema") != 1 or content.get("kind") != "street_net":
         raise InputError("not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1")
-    net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
-    digest = str(dict(content.get("files", {})).get(WEIGHTS_FILE))
-    state = shards.read_shards(where.parent, {WEIGHTS_FILE: digest})
+    with records.understood("a segmentation network", str(where)):
+        net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
+    state = shards.read_shards(where.parent, content.get("files"))
     shards.check_fit(state, net.state_dict(), where.parent)
     net.load_state_dict({name: value.float() for name, value in state.items()})
     return net.eval().to(memory_format=torch.channels_last)

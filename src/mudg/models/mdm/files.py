@@ -57,7 +57,8 @@ def read_description(path: Path | str) -> dict[str, Any]:
         raise InputError("no diffusion model here", where=str(where.parent), expected=f"a file {MODEL_FILE}",
                          remedy=f"give {where.parent / 'model'}" if inside else "")  # fmt: skip
     content = store.read_json(where)
-    if not isinstance(content, dict) or content.get("schema") != 1 or not isinstance(content.get("files"), dict):
+    known = isinstance(content, dict) and content.get("schema") == 1
+    if not known or not isinstance(content.get("files"), dict) or not isinstance(content.get("facts", {}), dict):
         raise InputError("not a model description of this version", where=str(where))
     return content
 
@@ -131,8 +132,10 @@ def load(path: Path | str = "embedded") -> MDM:
     """
     folder = folder_of(path)
     content = read_description(folder)
-    model = MDM(config_from_dict(content.get("config"), str(folder / MODEL_FILE)))
-    state, wanted = shards.read_shards(folder, content["files"]), model.state_dict()
-    shards.check_fit(state, wanted, folder)
+    config, state = config_from_dict(content.get("config"), str(folder / MODEL_FILE)), shards.read_shards(folder, content["files"])
+    with records.understood("a diffusion model", str(folder / MODEL_FILE)):
+        with torch.device("meta"):  # takes no memory: its size may be anything
+            shards.check_fit(state, MDM(config).state_dict(), folder)
+        model = MDM(config)
     model.load_state_dict(state)  # the numbers are converted as they are copied: no second set of them is in memory
     return model.eval()

@@ -71,7 +71,7 @@ def load(folder: Path, device: torch.device | str = "cpu", dtype: torch.dtype | 
     content, where = read_description(folder), str(Path(folder) / MODEL_FILE)
     if content.get("kind") != KIND:
         raise InputError("not a published-type model of this version", where=where, expected=f"schema 1, kind {KIND}")
-    with torch.device("meta"):
+    with torch.device("meta"), records.understood("a published-type model", where):
         model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
     state = shards.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
     shards.check_fit(state, model.state_dict(), Path(folder))

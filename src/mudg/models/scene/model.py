@@ -209,6 +209,9 @@ class SceneModel:
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
+        if "semantics" in table.columns and table["semantics"].shape[1:] != (len(classes),):
+            raise InputError("the Gaussians have other classes than the scene", expected=f"{len(classes)} channels",
+                got=str(tuple(table["semantics"].shape)))  # fmt: skip
         colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
         degree, axes = int(values["sh_degree"]), values.get("harmonics", "world")
         if axes not in ("world", "node"):

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry
+from mudg.base.errors import InputError
 from mudg.base.types import Track
 from mudg.core import harmonics
 from mudg.core.quaternions import left_product_matrix, rotation_matrix, slerp
@@ -319,10 +320,14 @@ class RigidNode:
             offsets = {f"{part}.{name}": value[:, cut] for part in ("column", "moment1", "moment2")
                        if (value := offsets.get(f"{part}.offsets")) is not None
                        for name, cut in (("shift", slice(0, 3)), ("yaw", 3))}  # fmt: skip
-        return cls(
-            str(facts["name"]), str(facts["label"]), facts["size_m"], tensors["times_s"].numpy(),
-            tensors["world_from_object"].numpy(), Table.from_state(offsets), bool(facts["learn_pose"]),
-        )  # fmt: skip
+        name, times, poses, table = str(facts["name"]), tensors["times_s"].numpy(), tensors["world_from_object"].numpy(), Table.from_state(offsets)
+        if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any():
+            raise InputError("the times of an object are out of order", where=f"times_s of {name}", got=str(times.ravel()[:8]))
+        problem = next(filter(None, map(geometry.rigid_problem, poses)), "") if poses.shape == (len(times), 4, 4) else f"shape {poses.shape}"
+        if problem or table["shift"].shape != (len(times), 3) or table["yaw"].shape != (len(times),):
+            raise InputError("the poses of an object do not fit its times", where=f"world_from_object of {name}", got=problem,
+                expected=f"a rigid pose, a shift and a yaw for each of {len(times)} times")  # fmt: skip
+        return cls(name, str(facts["label"]), facts["size_m"], times, poses, table, bool(facts["learn_pose"]))
 
 
 class DeformableNode(RigidNode):

@@ -16,6 +16,7 @@ import torch
 
 from mudg.base import palette, store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.records import understood
 from mudg.base.run_folder import run_state
 from mudg.core.table import Table
 from mudg.models.scene.appearance import CAMERA_POSE, RECORDED_COLOR, Appearance
@@ -23,7 +24,7 @@ from mudg.models.scene.model import CERTAINTY, SceneModel
 from mudg.models.scene.nodes import RigidNode
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting.rendering import DRAWING, drawing_facts
-from mudg.stages.fitting.storage import load_appearance, load_model
+from mudg.stages.fitting.storage import description_of, load_appearance, load_model
 
 START_METHOD = "street_gaussians"
 NEW_CLASS_LOGIT = -6.0
@@ -60,7 +61,8 @@ class StartFit:
             if found != expected:
                 raise InputError(f"the finished fit belongs to another {WHAT[name]}", where=f"{folder / 'run.json'}, inputs.{name}",
                                  expected=expected, got=str(found), remedy=f"fit street_gaussians to this {WHAT[name]} first")  # fmt: skip
-        method = store.read_json(folder / "model.json").get("facts", {}).get("method")
+        facts = description_of(folder).get("facts")
+        method = facts.get("method") if isinstance(facts, dict) else None
         if method != START_METHOD:
             raise InputError("a fit can only go on with one on recorded views", where=f"{folder / 'model.json'}, facts.method",
                              expected=START_METHOD, got=str(method), remedy=remedy)  # fmt: skip
@@ -138,8 +140,9 @@ def with_classes(model: SceneModel, classes: Sequence[int]) -> SceneModel:
 
 def all_classes(start: StartFit, classes: Sequence[int]) -> tuple[int, ...]:
     """Train ids of the finished fit's classes and of ``classes``, sorted."""
-    known = store.read_json(start.folder / "model.json")["classes"]
-    return tuple(sorted({*classes, *(i for i in map(int, known) if i < len(palette.CLASSES))}))
+    with understood("a fitted scene", str(start.folder / "model.json")):
+        known = list(map(int, description_of(start.folder)["classes"]))
+    return tuple(sorted({*classes, *(i for i in known if i < len(palette.CLASSES))}))
 
 
 def continued_appearance(start: StartFit, fresh: Appearance) -> Appearance:

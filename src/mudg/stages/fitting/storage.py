@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
 
 from mudg.base import store
-from mudg.base.errors import InputError
-from mudg.base.types import Scene
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.records import understood
+from mudg.base.types import Camera, Scene, View
+from mudg.models.folders import read_settings
 from mudg.models.scene.appearance import Appearance
 from mudg.models.scene.model import SceneModel
+from mudg.models.scene.nodes import RigidNode
+from mudg.stages.config.fit import DrawingConfig
+from mudg.stages.fitting.rendering import DRAWING, raster_of, render_view
 
 GAUSSIANS, RADIANCE = "gaussians", "radiance"
 
@@ -36,8 +46,9 @@ def load_appearance(folder: Path) -> Appearance:
     """What ``save_appearance`` wrote; nothing corrected where there is none."""
     if not (folder / "appearance.json").is_file():
         return Appearance({})
-    names = store.read_json(folder / "appearance.json")["names"]
-    return Appearance.from_state(names, store.read_tensors(folder / "appearance.safetensors"))
+    with understood("what a fit learnt about cameras", str(folder / "appearance.json")):
+        names = store.read_json(folder / "appearance.json")["names"]
+        return Appearance.from_state(names, store.read_tensors(folder / "appearance.safetensors"))
 
 
 def model_of_scene(folder: Path, scene: Scene) -> SceneModel:
@@ -61,7 +72,12 @@ def kind_of(folder: Path) -> str:
     """
     if not (Path(folder) / "model.json").is_file():
         raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
-    return str(store.read_json(Path(folder) / "model.json").get("kind", GAUSSIANS))
+    return str(description_of(folder).get("kind", GAUSSIANS))
+
+
+def description_of(folder: Path) -> dict[str, Any]:
+    """The JSON object in a fit's ``model.json``. InputError: there is none."""
+    return read_settings(Path(folder) / "model.json")
 
 
 def load_model(folder: Path) -> SceneModel:
@@ -77,7 +93,7 @@ def load_model(folder: Path) -> SceneModel:
                          remedy="`mudg render` shows it; for everything else fit with --method street_gaussians")  # fmt: skip
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
-    values = store.read_json(folder / "model.json")
+    values = description_of(folder)
     if values.get("schema") != 1:
         raise InputError(
             "unknown schema of a fitted scene",
@@ -86,4 +102,17 @@ def load_model(folder: Path) -> SceneModel:
             got=str(values.get("schema")),
         )
     groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
-    return SceneModel.from_state(values, groups)
+    with understood("a fitted scene", str(folder)):
+        model = SceneModel.from_state(values, groups)
+        if not (folder / store.MANIFEST).is_file():
+            _try_out(model)
+        return model
+
+
+def _try_out(model: SceneModel) -> None:
+    """Fail where the parts of a scene that no manifest vouches for do not fit together: draw a small picture while each object is there."""
+    TypeAdapter(DrawingConfig).validate_python(model.facts.get(DRAWING, {}))
+    camera = Camera("trial", 16, 12, 16.0, 16.0, 8.0, 6.0)
+    for time_s in {0.0, *(float(node.times_s.mean()) for node in model.nodes if isinstance(node, RigidNode))}:
+        with contextlib.suppress(UsageError, ResourceError):  # drawn in a way that this machine lacks
+            render_view(model, View(camera, np.eye(4), time_s), raster_of(model))

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.records import understood
 from mudg.models.radiance.field import RadianceField
 from mudg.models.radiance.march import Budget
-from mudg.stages.fitting.storage import RADIANCE, kind_of
+from mudg.stages.fitting.storage import RADIANCE, description_of, kind_of
 
 
 def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
@@ -35,9 +36,7 @@ def load_field(folder: Path) -> tuple[RadianceField, Budget]:
         )
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
-    values = store.read_json(folder / "model.json")
-    budget = dict(values["budget"])
-    return (
-        RadianceField.from_state(values, store.read_tensors(folder / "field.safetensors")),
-        Budget(**{**budget, "proposals": tuple(budget["proposals"])}),
-    )
+    values, tensors = description_of(folder), store.read_tensors(folder / "field.safetensors")
+    with understood("a radiance field", str(folder)):
+        budget = Budget(**{**values["budget"], "proposals": tuple(values["budget"]["proposals"])})
+        return RadianceField.from_state(values, tensors), budget
