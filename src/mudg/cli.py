@@ -7,13 +7,14 @@ progress and messages to stderr.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,10 +106,11 @@ def _synthesize(args: f.Synthesize) -> dict[str, Any]:
 
 def _fit(args: f.Fit) -> dict[str, Any]:
     from mudg.stages import fit
+    from mudg.stages.editing.runs import views_at
 
     made = fit.run(
         args.settings, args.scene, args.fused, args.out,
-        observations=args.observations, start=args.start_from, overwrite=args.overwrite,
+        observations=tuple(map(views_at, args.observations)), start=args.start_from, overwrite=args.overwrite,
     )  # fmt: skip
     return {"model": made}
 
@@ -180,10 +182,12 @@ def _score(args: f.Score) -> dict[str, Any]:
 
 
 def _name_and_folder(item: str) -> tuple[str, Path]:
+    from mudg.stages.editing.runs import views_at
+
     name, separator, folder = item.partition("=")
     if not separator or not name or not folder:
         raise UsageError("an entry of --views is not a name and a folder", expected="NAME=FOLDER", got=item)
-    return name, Path(folder)
+    return name, views_at(Path(folder), name)
 
 
 def _bench(args: f.Bench) -> dict[str, Any]:
@@ -456,7 +460,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             processes.hold_life_line()
         with _sigterm_interrupts():
-            call = VERBS[words[0]].call
+            call = functools.partial(_called, words[0])
             staged = addresses and words[0] != "batch"  # whose workers stage in and out for every step
             result = staging.run_staged(words[0], _with_named_output(args), call) if staged else call(args)
         code = int(result.pop("exit_code", 0))
@@ -489,6 +493,19 @@ def parse(words: Sequence[str]) -> Any:
 
     examples = "examples:\n" + "\n".join(f"  {line}" for line in VERBS[name].examples)
     return flags.parse(name, words[1:], f"{VERBS[name].summary}\n\n{examples}")
+
+
+def _called(verb: str, args: Any) -> dict[str, Any]:
+    """Call a verb; where it takes a part of a run, its folder will do."""
+    if verb in ("annotate", "fuse", "adapt", "synthesize", "fit", "render", "edit", "export", "asset", "page", "view", "score"):
+        from mudg.stages.editing import runs
+
+        given = {item.name: getattr(args, item.name) for item in fields(args) if item.name in runs.PARTS}
+        required = {"adapt": ("fused", "fitted"), "synthesize": ("fused",), "render": ("model",)}.get(verb, ())
+        if verb == "fit" and args.fused is None and args.settings.method != "emernerf" and not (args.scene / "scene.json").exists():
+            required = ("fused",)
+        args = replace(args, **runs.parts_of(given, required))
+    return VERBS[verb].call(args)
 
 
 def _with_named_output(args: Any) -> Any:

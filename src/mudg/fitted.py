@@ -42,7 +42,7 @@ class FittedScene:
 
     @classmethod
     def read(cls, folder: str | Path, device: str = "auto") -> FittedScene:
-        """Read the folder of a finished fit.
+        """Read the folder of a finished fit, or the best fit of a run.
 
         Args:
             device: where it is rendered: ``auto`` (CUDA if there is one), ``cpu``, ``cuda``, ``cuda:N``.
@@ -51,9 +51,10 @@ class FittedScene:
             InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no such device.
         """
         from mudg.core.raster.place import drawing_device
+        from mudg.stages.editing.runs import fit_at
         from mudg.stages.fit import load_model
 
-        return cls(load_model(Path(folder)).to(drawing_device(device, "render")))
+        return cls(load_model(fit_at(Path(folder))).to(drawing_device(device, "render")))
 
     @property
     def method(self) -> str:

@@ -6,9 +6,11 @@ import argparse
 import ast
 import contextlib
 import io
+import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, make_dataclass
+from dataclasses import field as dataclass_field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args, get_type_hints
@@ -97,7 +99,7 @@ class Fuse(Many):
     """Flags of ``mudg fuse``."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
-    """Scene directory written by ingest or annotate."""
+    """Scene directory written by ingest or annotate, or folder of mudg run."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder to write. A finished result of the same settings and inputs is verified and reused."""
     settings: Annotated[stage_config.FuseConfig, arg(name="")]
@@ -131,11 +133,11 @@ class Adapt(Output):
     """Flags of ``mudg adapt``."""
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
-    """Scene directory written by ingest or annotate."""
-    fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Point clouds written by fuse. The folder may also stand after SCENE without the flag."""
-    fitted: Annotated[Path, arg(metavar="FOLDER")]
-    """Gaussian scene written by fit, without virtual views."""
+    """Scene directory written by ingest or annotate, or folder of mudg run."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE)."""
+    fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Gaussian scene written by fit, without virtual views (not given: that of the run at SCENE)."""
     settings: Annotated[stage_config.AdaptConfig, arg(name="")]
 
 
@@ -144,9 +146,9 @@ class Synthesize(Output):
     """Flags of ``mudg synthesize``."""
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
-    """Scene directory written by ingest or annotate."""
-    fused: Annotated[Path, arg(metavar="FOLDER")]
-    """Point clouds written by fuse. The folder may also stand after SCENE without the flag."""
+    """Scene directory written by ingest or annotate, or folder of mudg run."""
+    fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE)."""
     fitted: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were
     trained with renders."""
@@ -160,7 +162,7 @@ class Fit(Output):
     """Flags of ``mudg fit``."""
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
-    """Scene directory written by ingest or annotate."""
+    """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag."""
     observations: Annotated[tuple[Path, ...], arg(metavar="FOLDER")] = ()
@@ -176,9 +178,9 @@ class RenderFlags(Output):
     """Flags of ``mudg render``."""
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
-    """Scene directory that the Gaussian scene was fitted to."""
-    model: Annotated[Path, arg(metavar="FOLDER")]
-    """Gaussian scene written by fit, or edit. It may also stand after SCENE without the flag."""
+    """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
+    model: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at SCENE)."""
     edits: Annotated[Path | None, arg(metavar="FILE.yaml")] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, arg(metavar="FOLDER")] = None
@@ -295,7 +297,7 @@ class Score(Output):
     """Flags of ``mudg score``."""
 
     scene: Annotated[Path, tyro.conf.Positional, arg(metavar="SCENE")]
-    """Scene directory that the views belong to."""
+    """Scene directory that the views belong to, or folder of mudg run."""
     views: Annotated[tuple[str, ...], arg(metavar="NAME=FOLDER")]
     """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE
     without the flag."""
@@ -421,7 +423,7 @@ class Doctor(Common):
     """Flags of ``mudg doctor``."""
 
     scene: Annotated[Path | None, tyro.conf.Positional, arg(metavar="[SCENE]")] = None
-    """Scene directory, or log in the custom format, to check (not given: report on this machine)."""
+    """Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this machine)."""
 
 
 FLAGS: dict[str, type[Common]] = {
@@ -448,6 +450,32 @@ class DemoListed(DemoOwn):
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
 
 
+OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
+"""Settings of ingest that the generated city does not have."""
+OWNERS = {"batch": "run", "asset": "import"}
+"""Part of a verb that its settings belong to, where their texts name no other."""
+PARTS: dict[str, dict[str, str]] = {
+    "batch": {
+        "run": "Process a list of logs, or go on with it.", "status": "Show how far a batch is.",
+        "cost": "Show core-hours, bytes and money of a batch.", "retry": "Forget failures, so that run tries again.",
+        "review": "Show results outside the bounds, with pictures.", "accept": "Accept results that wait for review.",
+        "reject": "Reject results that wait for review.",
+    },
+    "asset": {
+        "export": "Write one object of a fitted scene to a file that edit scripts can insert.",
+        "import": "Make an object, or a scene, of a file of Gaussians from another program.",
+    },
+    "bench": {
+        "mdm": "Measure the diffusion model against exact truth.", "poses": "Measure the correction of box tracks.",
+        "edit": "Measure edits of fitted scenes.", "shift": "Measure complete methods off the recorded path, against exact truth.",
+        "real": "Measure complete methods on real logs.", "paper": "Fill a table of a paper.",
+    },
+    "ingest": {"city": "Generate a city: a scene with exact truth."} | {
+        name: f"Convert a log in the format {name} to a scene directory."
+        for name in ("kitti", "kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom")
+    },
+}  # fmt: skip
+"""Parts of verbs that have a page of help of their own, and what each does."""
 SECOND_INPUTS: dict[str, str] = {"render": "--model", "fit": "--fused", "synthesize": "--fused", "adapt": "--fused", "score": "--views"}
 """Commands whose second input may also stand right after the scene, without its flag."""
 CHAINS: dict[str, type[Common]] = {"demo": DemoListed, "run": RunListed, "bench": BenchListed}
@@ -463,8 +491,10 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
     """
     if verb in CHAINS and {"-h", "--help"} & set(words):
         return _own_help(verb, description)
-    if verb in CHAINS:
-        words = ["--help" if word == "--help-all" else word for word in words]
+    part = next((word for word in words if not word.startswith("-")), "")
+    if part in PARTS.get(verb, {}) and {"-h", "--help", "--help-all"} & set(words):
+        return _part_help(verb, part, description)
+    words = ["--help" if word == "--help-all" else word for word in words]
     words = _second_input_named(verb, words)
     flags = FLAGS[verb]
     kind = get_type_hints(flags).get("settings")
@@ -534,6 +564,47 @@ def _second_input_named(verb: str, words: Sequence[str]) -> Sequence[str]:
     if flag is None or given or len(words) < 2 or any(word.startswith("-") for word in words[:2]):
         return words
     return [words[0], flag, *words[1:]]
+
+
+def _part_help(verb: str, part: str, description: str) -> Common:
+    """Print the flags that a part of a verb has, such as ``batch status``: those whose text does not begin with the names of others."""
+    flags = FLAGS[verb]
+    _explain(flags, {})
+
+    def kept(kind: type[Any], usual: Any) -> type[Any]:
+        """A dataclass with the fields that apply; usual: an instance with their defaults, None for the verb's own flags."""
+        rows, hints = [], get_type_hints(kind, include_extras=True)
+        for field in fields(kind):
+            text, shown, about = field.metadata.get("help", ""), hints[field.name], {"metadata": {"help": field.metadata.get("help", "")}}
+            own = usual is None and field.name in ("action", "name")
+            if own or not _applies(verb, part, field.name, text, usual is not None):
+                continue
+            if verb == "ingest" and field.name == "words":
+                shown = Annotated[tuple[str, ...], tyro.conf.Positional, arg(metavar="[OUT]" if part == "city" else "LOG [OUT]")]
+            value = field.default if usual is None else getattr(usual, field.name)
+            group = get_type_hints(kind)[field.name]
+            if is_dataclass(group):
+                smaller = kept(group, group() if value is MISSING else value)
+                shown = Annotated[smaller, arg(name="")] if field.name == "settings" else smaller
+                rows += [(field.name, shown, dataclass_field(default_factory=smaller, **about))] if fields(smaller) else []
+            else:
+                rows.append((field.name, shown, dataclass_field(**about, **({} if value is MISSING else {"default": value}))))
+        return make_dataclass(kind.__name__, rows, kw_only=True)
+
+    examples = [line for line in description.splitlines() if line.startswith(f"  mudg {verb} {part} ")]
+    about = PARTS[verb][part] + ("\n\nexamples:\n" + "\n".join(examples) if examples else "")
+    return tyro.cli(kept(flags, None), args=["--help"], prog=f"mudg {verb} {part}", description=about)
+
+
+def _applies(verb: str, part: str, name: str, text: str, inside: bool) -> bool:
+    """Whether a flag is one of a part of a verb."""
+    if verb == "ingest":
+        return name not in OF_A_LOG if part == "city" else name not in ("city", "format")
+    tags = [re.findall(r"[a-z0-9]+", tag) for tag in re.findall(r"(?:^|\. )((?:All but )?[a-z0-9,; ]+): ", text)]
+    named = {word for tag in tags for word in tag if word in PARTS[verb]}
+    if not named:
+        return not inside or part == OWNERS.get(verb, part)
+    return (part in named) != text.startswith("All but ")
 
 
 def _own_help(verb: str, description: str) -> Common:

@@ -8,7 +8,8 @@
 A setting has the name and the default that ``mudg VERB --help`` shows, without the dashes; a group of settings is a dictionary.
 ``config`` names a YAML file that is read before the keyword settings, as ``--config`` does. Unknown settings, values out of range and
 outputs that hold something else are refused as on the command line, with the errors of ``mudg.base.errors``. A finished result of the same
-settings and inputs is verified and reused; an interrupted one is resumed.
+settings and inputs is verified and reused; an interrupted one is resumed. Where a scene, clouds, a fit or views are read, the folder of a
+finished ``run`` will do: its own are taken.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, TypeVar
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError
 from mudg.stages import config as stage_config
+from mudg.stages.editing.runs import parts_of, scene_at, views_at
 
 Config = TypeVar("Config")
 AnyPath = str | Path
@@ -41,7 +43,7 @@ def annotate(
     from mudg.stages import annotate as stage
 
     return stage.run(
-        _settings(stage_config.AnnotateConfig, config, settings), Path(scene), Path(out), overwrite=overwrite
+        _settings(stage_config.AnnotateConfig, config, settings), scene_at(Path(scene)), Path(out), overwrite=overwrite
     )
 
 
@@ -51,7 +53,7 @@ def fuse(
     """Fuse the LiDAR of a scene into coloured clouds, one static and one per object; returns their folder."""
     from mudg.stages import fuse as stage
 
-    return stage.run(_settings(stage_config.FuseConfig, config, settings), Path(scene), Path(out), overwrite=overwrite)
+    return stage.run(_settings(stage_config.FuseConfig, config, settings), scene_at(Path(scene)), Path(out), overwrite=overwrite)
 
 
 def learn(out: AnyPath, *, overwrite: bool = False, config: AnyPath | None = None, **settings: Any) -> Path:
@@ -79,7 +81,8 @@ def adapt(
     from mudg.stages import adapt as stage
 
     made = _settings(stage_config.AdaptConfig, config, settings)
-    return stage.run(made, Path(scene), Path(fused), Path(fitted), Path(out), overwrite=overwrite)
+    parts = parts_of({"scene": scene, "fused": fused, "fitted": fitted})
+    return stage.run(made, parts["scene"], parts["fused"], parts["fitted"], Path(out), overwrite=overwrite)
 
 
 def synthesize(
@@ -95,7 +98,10 @@ def synthesize(
     from mudg.stages import synthesize as stage
 
     made = _settings(stage_config.SynthesizeConfig, config, settings)
-    return stage.run(made, Path(scene), Path(fused), Path(out), fitted=_optional(fitted), edits=_optional(edits), overwrite=overwrite)
+    parts = parts_of({"scene": scene, "fused": fused, "fitted": fitted})
+    return stage.run(
+        made, parts["scene"], parts["fused"], Path(out), fitted=parts["fitted"], edits=_optional(edits), overwrite=overwrite
+    )
 
 
 def fit(
@@ -112,9 +118,10 @@ def fit(
     from mudg.stages import fit as stage
 
     made = _settings(stage_config.FitConfig, config, settings)
+    parts = parts_of({"scene": scene, "fused": fused, "start_from": start_from})
     return stage.run(
-        made, Path(scene), _optional(fused), Path(out),
-        observations=_several(observations), start=_optional(start_from), overwrite=overwrite,
+        made, parts["scene"], parts["fused"], Path(out),
+        observations=tuple(map(views_at, _several(observations))), start=parts["start_from"], overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -132,7 +139,8 @@ def render(
     from mudg.stages import render as stage
 
     made = _settings(stage_config.RenderConfig, config, settings)
-    return stage.run(made, Path(scene), Path(model), Path(out), edits=_optional(edits), fused=_optional(fused), overwrite=overwrite)
+    parts = parts_of({"scene": scene, "model": model, "fused": fused})
+    return stage.run(made, parts["scene"], parts["model"], Path(out), edits=_optional(edits), fused=parts["fused"], overwrite=overwrite)
 
 
 def page(
@@ -221,8 +229,9 @@ def score(
         raise UsageError(
             "views are names with their folders", where="views", expected="{name: folder}", got=repr(views)
         )
-    folders = {name: Path(folder) for name, folder in views.items()}
-    return stage.run(made, Path(scene), folders, Path(out), fused=_optional(fused), overwrite=overwrite)
+    folders = {name: views_at(Path(folder), name) for name, folder in views.items()}
+    parts = parts_of({"scene": scene, "fused": fused})
+    return stage.run(made, parts["scene"], folders, Path(out), fused=parts["fused"], overwrite=overwrite)
 
 
 def run(

@@ -106,6 +106,36 @@ def refuse(problems: list[str]) -> None:
     assert not problems, "\n" + "\n".join(problems)
 
 
+CONNECTS = {
+    "socket", "ssl", "urllib.request", "http", "ftplib", "smtplib", "poplib", "imaplib", "telnetlib", "xmlrpc", "asyncio", "requests",
+    "httpx", "aiohttp", "websockets", "paramiko", "fsspec", "s3fs", "gcsfs", "adlfs", "ray", "torch.distributed",
+    "torch.hub",
+}  # fmt: skip
+CONNECTING = {
+    "base/remote.py": {"fsspec"}, "stages/batches/on_ray.py": {"ray"}, "stages/learning/parallel.py": {"torch.distributed"},
+    "stages/viewing/server.py": {"http"}, "stages/viewing/view.py": {"http"},
+}  # fmt: skip
+"""Modules that may reach a network, and what of. SECURITY.md tells when they do."""
+
+
+def test_only_these_modules_can_open_a_connection(package_dir: Path, repository: Path) -> None:
+    problems = []
+    for name, tree in parsed(package_dir):
+        for line, module in imported_modules(tree):
+            kind = next((one for one in CONNECTS if module == one or module.startswith(f"{one}.")), None)
+            if kind not in (None, "socket") and kind not in CONNECTING.get(name, ()):
+                problems.append(f"{name}:{line}: imports {module}")
+        problems += [
+            f"{name}:{node.lineno}: socket.{node.attr}" for node in ast.walk(tree)
+            if isinstance(node, ast.Attribute) and dotted(node).startswith("socket.") and node.attr not in ("gethostname", "timeout")
+        ]  # fmt: skip
+    refuse(problems)
+    told = (repository / "SECURITY.md").read_text(encoding="utf-8")
+    for word in ("s3://", "ray", "slurm", "torchrun", "mudg view", "credentials", "--token", "127.0.0.1"):
+        assert word in told, word
+    assert "No command opens a connection." not in told + (repository / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+
 def test_imports_point_down(package_dir: Path) -> None:
     problems = []
     for name, tree in parsed(package_dir):

@@ -66,7 +66,7 @@ def report_machine() -> dict[str, Any]:
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
-    """Check a scene directory or zip, or a log in the neutral layout, and say in words what is wrong or odd.
+    """Check a scene directory or zip, that of a run, or a log in the neutral layout, and say in words what is wrong or odd.
 
     Returns:
         Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a sound
@@ -76,7 +76,9 @@ def report_scene(scene: Path) -> dict[str, Any]:
     from mudg.data.importers import RECOGNISERS
     from mudg.data.importers.custom.importer import check_log
     from mudg.data.scene.check import Finding, check_scene, worst_first
+    from mudg.stages.editing.runs import scene_of_run
 
+    scene = scene if (scene / "scene.json").is_file() else scene_of_run(scene) or scene
     kind = next((name for name, looks_like in RECOGNISERS.items() if looks_like(scene)), "")
     is_log = kind == "custom" and not (scene / "scene.json").is_file()
     found = check_log(scene) if is_log else check_scene(scene)

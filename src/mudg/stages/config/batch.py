@@ -56,6 +56,6 @@ class BatchConfig:
     scenes: tuple[str, ...] = ()
     """accept, reject: names of scenes that wait for review; '*' stands for any letters."""
     price: float = Field(default=0.0, ge=0)
-    """Price of one core-hour, for mudg batch cost."""
+    """cost: price of one core-hour."""
     storage_price: float = Field(default=0.0, ge=0)
-    """Price of one gigabyte of results for a month, for mudg batch cost."""
+    """cost: price of one gigabyte of results for a month."""

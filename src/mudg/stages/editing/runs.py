@@ -1,13 +1,15 @@
-"""The parts of what can be edited: a fitted scene by itself, or a folder of ``mudg run`` with its scene, clouds and fits."""
+"""The parts of a run: a fitted scene by itself, or a folder of ``mudg run`` with its scene, clouds and fits. Wherever a command
+takes one of them, it also takes the folder of the run."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from mudg.base import store
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, UsageError
 
 BEST_FIRST: Final = ("mudg_s", "street_gaussians")
 """Fits that ``mudg run`` makes; where one has to speak for all, the first that is there."""
@@ -43,7 +45,7 @@ def find_run(folder: Path) -> RunParts:
     if (folder / "model.json").is_file():
         return RunParts({"": folder}, None, None, False)
     fits = {name: folder / "fit" / name for name in BEST_FIRST if (folder / "fit" / name / "model.json").is_file()}
-    scene, fused = _scene_of(folder), folder / "fuse"
+    scene, fused = scene_of_run(folder), folder / "fuse"
     if not fits or scene is None or not (fused / "fuse.json").is_file():
         there = {"fit": bool(fits), "scene": scene is not None, "fuse": (fused / "fuse.json").is_file()}
         missing = [name for name, found in there.items() if not found]
@@ -53,7 +55,7 @@ def find_run(folder: Path) -> RunParts:
     return RunParts(fits, scene, fused, True)
 
 
-def _scene_of(folder: Path) -> Path | None:
+def scene_of_run(folder: Path) -> Path | None:
     """The scene that a run worked on: labelled by it, made by it, or given to it."""
     for name in ("annotate", "scene"):
         if (folder / name / "scene.json").is_file():
@@ -63,3 +65,80 @@ def _scene_of(folder: Path) -> Path | None:
     except (InputError, KeyError, TypeError):
         return None
     return source if (source / "scene.json").is_file() or source.suffix == ".zip" else None
+
+
+# where a part is asked for, and a run given --------------------------------------------------------------------------------
+
+
+def scene_at(path: Path) -> Path:
+    """The scene at a path: itself, or that of a run.
+
+    Raises:
+        InputError: nothing is there, or something else.
+    """
+    if (path / "scene.json").is_file() or path.is_file():
+        return path
+    found = scene_of_run(path)
+    if found is None:
+        what = "folder is not a scene: it has no scene.json" if path.is_dir() else "no such file or folder"
+        raise InputError(what, where=str(path), expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`")
+    return found
+
+
+def fused_at(path: Path) -> Path:
+    """The fused clouds at a path: itself, or those of a run; InputError otherwise."""
+    for folder in (path, path / "fuse"):
+        if (folder / "fuse.json").is_file():
+            return folder
+    raise InputError("file not found", where=str(path / "fuse.json"), expected="a folder made by `mudg fuse`, or by `mudg run`")
+
+
+def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
+    """The fitted scene at a path: itself, or the first of ``order`` that a run has; InputError otherwise."""
+    for folder in (path, *(path / "fit" / name for name in order)):
+        if (folder / "model.json").is_file():
+            return folder
+    raise InputError("this folder holds no fitted scene", where=str(path), expected="a folder made by `mudg fit`, or by `mudg run`",
+        got="" if path.is_dir() else "no such folder")  # fmt: skip
+
+
+def plain_fit_at(path: Path) -> Path:
+    """``fit_at``, of a run the fit without virtual views."""
+    return fit_at(path, BEST_FIRST[::-1])
+
+
+def views_at(path: Path, name: str = "") -> Path:
+    """The views at a path: itself, or of a run those that it rendered with a method, or without one those that it generated."""
+    folders = (path / "render" / name, path / "synthesize") if name else (path / "synthesize",)
+    is_run = (path / "synthesize").is_dir() and scene_of_run(path) is not None
+    return next((folder for folder in folders if is_run and folder.is_dir()), path)
+
+
+PARTS: Final = {"scene": scene_at, "fused": fused_at, "model": fit_at, "fitted": plain_fit_at, "start_from": plain_fit_at}
+"""Inputs of commands, and how each is found at a path."""
+_WORDS: Final = {
+    "fused": "point clouds made by `mudg fuse`", "model": "a folder made by `mudg fit`", "fitted": "a folder made by `mudg fit`",
+}  # fmt: skip
+
+
+def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str, Any]:
+    """The inputs of a command, each as the part that it stands for; before anything heavy is loaded.
+
+    Args:
+        given: name -> path, or None; names that are not in ``PARTS`` are left as they are. required: those that a run at ``scene``
+            gives where they are None.
+
+    Raises:
+        UsageError: one is missing. InputError: one is not there, or something else.
+    """
+    scene = given.get("scene")
+    is_run = scene is not None and not (Path(scene) / "scene.json").is_file() and scene_of_run(Path(scene)) is not None
+    found = dict(given)
+    for name, path in given.items():
+        if path is None and name in required:
+            if not is_run:
+                raise UsageError(f"no --{name} was given", expected=f"{_WORDS[name]}, or the folder of a run in the place of SCENE")
+            path = scene
+        if path is not None and name in PARTS:
+            found[name] = PARTS[name](Path(path))
+    return found
