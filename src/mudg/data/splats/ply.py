@@ -112,7 +112,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
     if len(passed) > len(moving):
         notes.append(f"columns passed over: {listed([name for name in passed if name not in moving])}")
-    step = spacing_m(means) if any(table.dtype[name].itemsize == 4 for name in "xyz") else 0.0
+    single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
+    step = spacing_m(means[:, single]) if single else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
 
 
