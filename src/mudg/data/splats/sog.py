@@ -83,7 +83,7 @@ class SogMeta(ForeignRecord):
     sh0: SogTable
     shN: SogHarmonics | None = None
     asset: Any = None
-    antialias: bool | None = None
+    antialias: Any = None
     model: Any = None
 
 
