@@ -97,7 +97,7 @@ def spz(
     zone = b"".join(struct.pack("<II", kind, len(part)) + part for kind, part in extensions)
     head = struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, 0)
     if version < 4:
-        return gzip.compress(head + b"".join(planes) + zone + more)
+        return gzip.compress(head + b"".join(planes) + zone + more, mtime=0)
     planes = [plane for plane in planes if plane]
     frames = [b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(p)) + (len(p) << 3 | 1).to_bytes(3, "little") + p for p in planes]
     head = head[:15] + bytes([len(frames)]) + struct.pack("<I12x", 32 + len(zone))

@@ -84,6 +84,9 @@ MARKED: dict[str, tuple[bytes, str, bool]] = {
     "ply flags": (foreign.ply(head=["comment train_flags antialiasing"]), ".ply", True),
     "ply nerfstudio": (foreign.ply(head=["comment rasterize_mode: antialiased"]), ".ply", True),
     "ply obj_info": (foreign.ply(head=["obj_info anti_aliased: true"]), ".ply", True),
+    "ply negated": (foreign.ply(head=["comment not antialiased"]), ".ply", False),
+    "ply disabled": (foreign.ply(head=["comment antialiasing: disabled"]), ".ply", False),
+    "sog number": (foreign.sog(antialias=1), ".sog", True),
     "ply silent": (foreign.ply(head=["comment made elsewhere"]), ".ply", False),
     "compressed ply": (foreign.compressed_ply(-1, 1, head=["comment SplatRenderMode: mip"]), ".ply", True),
     "compressed ply silent": (foreign.compressed_ply(-1, 1), ".ply", False),
@@ -311,6 +314,19 @@ def test_unknown_columns_are_listed_once_and_without_control_characters(capsys: 
 def test_gaussians_with_columns_of_other_names_get_the_right_remedy(changes: dict[str, Any], missing: str) -> None:
     with pytest.raises(InputError, match=rf"missing[\s\S]*'{missing}'[\s\S]*name the columns"):
         read(foreign.ply(rows(**changes)))
+
+
+def test_classes_of_others_are_no_train_ids() -> None:
+    assert read(foreign.ply(rows(**{"class": [2, 5, 6]}), kinds={"class": "uchar"})).class_ids is None
+    ids = read(foreign.ply(rows(**{"class": [2.0, 255.0, 6.0]}))).class_ids
+    assert ids is not None and ids.tolist() == [2, 255, 6]
+
+
+def test_harmonics_of_degree_4_lose_what_is_beyond_3(capsys: pytest.CaptureFixture[str]) -> None:
+    table = rows(**{f"f_rest_{n}": float(n) for n in range(72)})
+    cloud = read(foreign.ply(table), axes="world")
+    assert np.allclose(cloud.sh[0, 1:], [[float(k), 24.0 + k, 48.0 + k] for k in range(15)])
+    assert "beyond degree 3" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_points_are_still_called_points() -> None:

@@ -194,7 +194,7 @@ def listed(names: Iterable[str]) -> str:
 # -- order and packing ---------------------------------------------------------------------------------------------------
 
 
-def morton_order(means: Floats) -> NDArray[np.intp]:
+def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
     """Rows ordered along a curve that keeps neighbours together (Morton, 21 bits an axis); stable."""
     if len(means) == 0:
         return np.zeros(0, np.intp)

@@ -62,7 +62,7 @@ class SplatCloud:
         """Some rows, in the order given."""
         classes = None if self.class_ids is None else self.class_ids[rows]
         columns = (self.means[rows], self.quats[rows], self.log_scales[rows], self.logits[rows], self.sh[rows])
-        return SplatCloud(*columns, classes, self.antialias)
+        return SplatCloud(*columns, class_ids=classes, antialias=self.antialias)
 
     def moved(self, a_from_b: Matrix) -> SplatCloud:
         """The same Gaussians in another frame: places, rotations and harmonics; ``a_from_b`` rigid f64[4, 4]."""
@@ -101,7 +101,7 @@ def joined(clouds: Sequence[SplatCloud]) -> SplatCloud:
         unknown = [np.full(len(c), 255, np.uint8) if c.class_ids is None else c.class_ids for c in parts]
         classes = np.concatenate(unknown)
     columns = [np.concatenate([getattr(c, name) for c in parts]) for name in ("means", "quats", "log_scales", "logits", "sh")]
-    return SplatCloud(*columns, classes, any(cloud.antialias for cloud in parts))
+    return SplatCloud(*columns, class_ids=classes, antialias=any(cloud.antialias for cloud in parts))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

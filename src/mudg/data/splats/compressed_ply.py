@@ -111,8 +111,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     three = (np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1) / 1023 - 0.5) * np.sqrt(2)
     quats = binary.from_smallest_three(word >> 30, three)
     sh = np.concatenate([((color - 0.5) / C0)[:, None], _rest(file.tables.get("sh"), len(vertex), where)], 1)
-    columns = [values.astype(np.float32) for values in (quats, scales)]
-    cloud = checked(SplatCloud(means, *columns, logit(rgba[:, 3]), sh.astype(np.float32), None, file.antialias), where)
+    columns = [values.astype(np.float32) for values in (quats, scales, logit(rgba[:, 3]), sh)]
+    cloud = checked(SplatCloud(means, *columns, antialias=file.antialias), where)
     step = spacing_m(np.concatenate([low, high])) if chunk.dtype["min_x"].itemsize == 4 else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, file.notes, file.warnings)
 

@@ -296,8 +296,8 @@ class _GlbFile:
         if beyond:
             self.warnings[f"harmonics beyond degree 3 were dropped: {binary.listed(beyond)}"] = None
         self.step_m = max(self.step_m, spacing_m(means))
-        columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
-        return checked(SplatCloud(means, *columns), self.where)
+        quats, logs, logits, sh = (values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh))
+        return checked(SplatCloud(means, quats, logs, logits, sh), self.where)
 
     def _logits_and_logs(self, opacity: Array, scale: Array) -> tuple[NDArray[np.floating], Array]:
         """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and sizes."""

@@ -42,7 +42,7 @@ _TYPES: Final = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 _LENGTHS: Final = {name for name, kind in _TYPES.items() if kind[0] != "f"}
-_REST: Final = {0: 0, 9: 1, 24: 2, 45: 3}
+_REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest`` columns: degree."""
 
 
@@ -78,18 +78,18 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         raise InputError(
             "the number of f_rest columns fits no degree of harmonics",
             where=where,
-            expected="0, 9, 24 or 45",
+            expected=", ".join(map(str, _REST)),
             got=str(rest),
         )
     sh = np.concatenate(
         [
             columns_of(table, _indexed("f_dc", 3))[:, None],
-            coefficient_major(columns_of(table, _indexed("f_rest", rest))),
+            coefficient_major(columns_of(table, _indexed("f_rest", rest)))[:, :15],
         ],
         1,
     )
     classes = None
-    if "class" in names:
+    if ours := "class" in names and table.dtype["class"].kind == "f":  # others number classes in whole numbers, and otherwise
         with np.errstate(invalid="ignore"):
             ids = np.asarray(table["class"], np.float64)
             classes = np.where((ids >= 0) & (ids <= 255), ids, 255).astype(np.uint8)
@@ -105,14 +105,18 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if filters:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
         notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
-    passed = [name for name in names if name not in {*wanted, *_indexed("f_rest", rest), "nx", "ny", "nz", "class", *filters}]
+    used = {*wanted, *_indexed("f_rest", rest), "nx", "ny", "nz", *filters, *(["class"] if ours else [])}
+    passed = [name for name in names if name not in used]
     moving = [name for name in passed if name.lower().startswith(_MOTION)]
     warnings = list(file.warnings)
+    if _REST[rest] > 3:
+        warnings.append("harmonics beyond degree 3 were dropped")
     if moving:
         warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
     if len(passed) > len(moving):
         notes.append(f"columns passed over: {listed([name for name in passed if name not in moving])}")
-    step = spacing_m(means) if any(table.dtype[name].itemsize == 4 for name in "xyz") else 0.0
+    single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
+    step = spacing_m(means[:, single]) if single else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
 
 
@@ -288,13 +292,13 @@ def _antialias(comments: list[str], warnings: list[str]) -> bool:
     found = False
     for line in comments:
         mode = re.search(r"(?i)\b(?:splat|raster\w*|render)[ _-]?(?:render)?[ _-]?mode\W*(\w+)", line)
-        mark = re.search(r"(?i)\banti[ _-]?alias(?:ed|ing)?\b\W*(\w*)", line)
+        mark = re.search(r"(?i)(\bnot? )?\banti[ _-]?alias(?:ed|ing)?\b\W*(\w*)", line)
         if mode and mode[1].lower() in _MODES:
             found = _MODES[mode[1].lower()]
         elif mode:
             warnings.append(f"the comment {line[:80]!r} names a way of drawing that is not known: drawn as usual")
         elif mark:
-            found = mark[1].lower() not in ("0", "false", "no", "off", "none")
+            found = not mark[1] and mark[2].lower() not in ("0", "false", "no", "off", "none", "disabled")
     return found
 
 

@@ -83,7 +83,7 @@ class SogMeta(ForeignRecord):
     sh0: SogTable
     shN: SogHarmonics | None = None
     asset: Any = None
-    antialias: bool | None = None
+    antialias: Any = None
     model: Any = None
 
 
@@ -228,9 +228,9 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     sh = np.array(meta.sh0.codebook)[first[:, :3]][:, None]
     if meta.shN is not None:
         sh = np.concatenate([sh, _harmonics(meta.shN, pixels, where)], 1)
-    columns = [values.astype(np.float32) for values in (quats, scales)]
+    columns = [values.astype(np.float32) for values in (quats, scales, logit(first[:, 3] / 255.0), sh)]
     antialias = meta.model == "antialiased" if meta.model is not None else bool(meta.antialias)
-    cloud = checked(SplatCloud(means, *columns, logit(first[:, 3] / 255.0), sh.astype(np.float32), None, antialias), where)
+    cloud = checked(SplatCloud(means, *columns, antialias=antialias), where)
     unknown = meta.unknown()
     notes = (f"fields of meta.json passed over: {binary.listed(unknown)}",) if unknown else ()
     warnings = [] if meta.model in _MODELS else [f"its model {str(meta.model)[:40]!r} is not known: drawn as usual"]

@@ -37,7 +37,7 @@ _HARMLESS: Final = {0xADBE0002}
 """Extensions that say nothing about the Gaussians: where a viewer's camera may go."""
 
 
-def fractional_bits(means: Floats) -> int:
+def fractional_bits(means: NDArray[np.floating]) -> int:
     """Fractional bits with which all places fit into 24 bits."""
     farthest = float(np.abs(means).max(initial=0))
     bits = BITS
@@ -247,7 +247,7 @@ def _cloud(planes: list[bytes], head: _Header, where: str) -> SplatCloud:
         xyzw = np.column_stack([xyz, np.sqrt(np.maximum(1 - (xyz**2).sum(1), 0))])
     dc = (colors.reshape(-1, 1, 3) / 255 - 0.5) / _COLOR
     sh = np.concatenate([dc, (rest.reshape(count, -1, 3)[:, :15].astype(np.float64) - 128) / 128], 1)
-    columns = [values.astype(np.float32) for values in (xyzw[:, [3, 0, 1, 2]], scales.reshape(-1, 3) / 16 - 10)]
     opacity = opacities.astype(np.float64).clip(0.5, 254.5) / 255
-    antialias = bool(head.flags & _ANTIALIAS)
-    return checked(SplatCloud(means, *columns, logit(opacity), sh.astype(np.float32), None, antialias), where)
+    stated = (xyzw[:, [3, 0, 1, 2]], scales.reshape(-1, 3) / 16 - 10, logit(opacity), sh)
+    columns = [values.astype(np.float32) for values in stated]
+    return checked(SplatCloud(means, *columns, antialias=bool(head.flags & _ANTIALIAS)), where)

@@ -285,4 +285,4 @@ def _points(given: Exported) -> PointCloud | None:
     cloud = splat_scene(given.model, 0.0, (given.model.nodes[0].name,)).nodes[0].cloud
     solid = cloud.take(cloud.opacity > 0.5)
     rgb = np.round((solid.sh[:, 0] * C0 + 0.5).clip(0, 1) * 255).astype(np.uint8)
-    return PointCloud(np.ascontiguousarray(solid.means), rgb, "world")
+    return PointCloud(np.ascontiguousarray(solid.means, np.float32), rgb, "world")
