@@ -19,7 +19,10 @@ from mudg.stages.config import IngestConfig
 from mudg.stages.score_truth import truth_of
 
 
-@pytest.mark.parametrize("words", ["doctor", "fuse scene --out out", "view run", "convert a --to b", "run city --out out", "batch status out"])
+GONE = ["doctor", "fuse scene --out out", "view run", "convert a --to b", "run city --out out", "batch status out"]
+
+
+@pytest.mark.parametrize("words", GONE)
 def test_a_current_folder_that_is_gone_is_said(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -68,8 +71,8 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 @pytest.mark.parametrize("change", [
-    {"city": 3}, {"city": None}, {"city": []}, {"city": {}}, {"city": {"n_frames": -1}}, {"city": {"unknown": 1}}, {"generator_version": None},
-    {"n_frames": 2000}, {"seed": 1}, {"seed": 10**18}, {"light": "no"}, {"textures": "/nowhere"}, {},
+    {"city": 3}, {"city": None}, {"city": []}, {"city": {}}, {"city": {"n_frames": -1}}, {"city": {"unknown": 1}},
+    {"generator_version": None}, {"n_frames": 2000}, {"seed": 1}, {"seed": 10**18}, {"light": "no"}, {"textures": "/nowhere"}, {},
 ], ids=str)  # fmt: skip
 def test_a_scene_that_claims_to_be_another_city_has_no_truth(change: dict[str, Any], city: Any) -> None:
     recipe = city.source.recipe

@@ -454,7 +454,7 @@ def run_limited(
             raise ResourceError("the converting process was ended from outside, most likely for want of memory",
                 where=str(where),
                 expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, raise the limit (ulimit -v), or convert on a machine with more memory") from error  # fmt: skip
+                remedy="close other programs, raise the limit (ulimit -v), or take a machine with more memory") from error  # fmt: skip
 
 
 def _limited(
