@@ -18,7 +18,6 @@ from mudg.stages import ingest
 from mudg.stages.config import IngestConfig
 from mudg.stages.score_truth import truth_of
 
-
 GONE = ["doctor", "fuse scene --out out", "view run", "convert a --to b", "run city --out out", "batch status out"]
 
 
