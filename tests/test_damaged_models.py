@@ -1,4 +1,4 @@
-"""Folders of models whose files are damaged and that no manifest vouches for: read in words or not at all, never a mistake of the program."""
+"""Folders of models whose files are damaged and that no manifest vouches for: an error in words, or a scene that can be drawn."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mudg.models.mdm import files as mdm_files
 from mudg.models.published import files as published_files
 from mudg.models.radiance.march import Budget
 from mudg.models.scene.appearance import RECORDED_COLOR, Appearance
-from mudg.stages.fitting.continued import all_classes, StartFit
+from mudg.stages.fitting.continued import StartFit, all_classes
 from mudg.stages.fitting.storage import kind_of, load_appearance, save_appearance, save_model
 from mudg.stages.radiance.storage import load_field, save_field
 
@@ -59,8 +59,7 @@ def altered_tensors(tensors: dict[str, np.ndarray]) -> Iterator[dict[str, np.nda
 def ends_in_words(call: Callable[[], object]) -> bool:
     try:
         call()
-    except MudgError as error:
-        assert len(str(error)) < 3000
+    except MudgError:
         return True
     return False
 

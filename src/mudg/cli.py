@@ -442,6 +442,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if words[0] in ("-V", "--version"):
             _say(f"mudg {version()}")
             return 0
+        _require_current_folder()
         # Idle threads of OpenMP and of numpy's BLAS that spin would take the cores from others; must precede torch and numpy.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -478,6 +479,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _complain(f"error: {told}")
         return told.exit_code
+
+
+def _require_current_folder() -> None:
+    """Relative paths count from it, and libraries end the process without it."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        remedy = "change to a folder that exists"
+        raise ResourceError("the current folder is gone, or cannot be entered", got=str(error), remedy=remedy) from error
 
 
 def parse(words: Sequence[str]) -> Any:

@@ -454,7 +454,7 @@ def run_limited(
             raise ResourceError("the converting process was ended from outside, most likely for want of memory",
                 where=str(where),
                 expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, or convert on a machine with more memory") from error  # fmt: skip
+                remedy="close other programs, raise the limit (ulimit -v), or take a machine with more memory") from error  # fmt: skip
 
 
 def _limited(
@@ -467,6 +467,8 @@ def _limited(
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + limit_bytes
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]  # of the shell (ulimit -v), which cannot be raised
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     try:
         work()

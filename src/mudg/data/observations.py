@@ -149,7 +149,7 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
                 raise InputError("an image has another size than its camera", where=str(path),
                     expected=f"{camera.width}x{camera.height}", got=f"{image.size[0]}x{image.size[1]}")  # fmt: skip
             return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
 
 

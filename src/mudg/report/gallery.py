@@ -157,7 +157,7 @@ def _thumbnail(picture: Path | None, width: int) -> str:
         return ""
     try:
         image = Image.open(io.BytesIO(store.read_bytes(picture))).convert("RGB")
-    except (InputError, UnidentifiedImageError, OSError):
+    except (InputError, UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
         return ""
     image.thumbnail((width, width))
     content = io.BytesIO()

@@ -71,6 +71,12 @@ def truth_of(scene: Scene) -> Truth:
     """Exact truth for a generated city; else the recorded frame a view belongs to."""
     if scene.source.recipe is not None:
         world = CityWorld.from_source(scene.source)
+        for frame in scene.frames:
+            there, stated = world.ego_path().pose_at(frame.view.time_s), scene.ego.pose_at(frame.view.time_s)
+            if there is None or stated is None or not np.allclose(there, stated, atol=1e-3):
+                raise InputError("the scene is not the generated city that its recipe names, so its truth would be another street's",
+                    where=f"{scene.root}: source.recipe, frame {frame.id}", expected="the path of the vehicle that the recipe makes",
+                    remedy="generate the city again; in scenes of other origin, leave the recipe out")  # fmt: skip
         moving = np.array(city_logs.moving_instances(world), np.int32)
         return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
     return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))

@@ -74,7 +74,7 @@ def surface(path: Path) -> Pixels:
     try:
         with Image.open(io.BytesIO(store.read_bytes(path))) as image:
             small = image.convert("RGB").resize((SIDE_PX, SIDE_PX), Image.Resampling.BOX)
-    except OSError as error:
+    except (Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("a texture cannot be read", where=str(path), got=str(error)) from error
     light = (np.asarray(small, np.float32) / 255) ** 2.2
     mean = light.mean((0, 1))

@@ -143,7 +143,12 @@ class CityWorld:
             raise InputError("the scene was made by another version of the generator",
                 where="source.recipe.generator_version", expected=str(GENERATOR_VERSION),
                 got=str(recipe.get("generator_version")), remedy="generate it again")  # fmt: skip
-        return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
+        if not isinstance(recipe["city"], Mapping):
+            raise InputError("the recipe of a generated city is no object", where="source.recipe.city", got=str(recipe["city"]))
+        try:
+            return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
+        except UsageError as error:  # nobody asked for these settings: a file states them
+            raise InputError(error.what, where=error.where, expected=error.expected, got=error.got, remedy="generate it again") from error
 
     def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
         """The same world, light and shadows included, with some vehicles or people elsewhere or gone.

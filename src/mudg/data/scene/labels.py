@@ -144,7 +144,7 @@ def _decode_grey(content: bytes, where: str) -> NDArray[np.uint8]:
                 got = f"mode {image.mode}, {image.size}"
                 raise InputError("label image is not 8-bit grey", where=where, expected="mode L", got=got)
             return np.array(image.convert("L") if image.mode == "1" else image, np.uint8)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
 
 

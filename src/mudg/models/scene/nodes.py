@@ -320,10 +320,12 @@ class RigidNode:
             offsets = {f"{part}.{name}": value[:, cut] for part in ("column", "moment1", "moment2")
                        if (value := offsets.get(f"{part}.offsets")) is not None
                        for name, cut in (("shift", slice(0, 3)), ("yaw", 3))}  # fmt: skip
-        name, times, poses, table = str(facts["name"]), tensors["times_s"].numpy(), tensors["world_from_object"].numpy(), Table.from_state(offsets)
+        name, table = str(facts["name"]), Table.from_state(offsets)
+        times, poses = tensors["times_s"].numpy(), tensors["world_from_object"].numpy()
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any():
             raise InputError("the times of an object are out of order", where=f"times_s of {name}", got=str(times.ravel()[:8]))
-        problem = next(filter(None, map(geometry.rigid_problem, poses)), "") if poses.shape == (len(times), 4, 4) else f"shape {poses.shape}"
+        fits = poses.shape == (len(times), 4, 4)
+        problem = next(filter(None, map(geometry.rigid_problem, poses)), "") if fits else f"shape {poses.shape}"
         if problem or table["shift"].shape != (len(times), 3) or table["yaw"].shape != (len(times),):
             raise InputError("the poses of an object do not fit its times", where=f"world_from_object of {name}", got=problem,
                 expected=f"a rigid pose, a shift and a yaw for each of {len(times)} times")  # fmt: skip

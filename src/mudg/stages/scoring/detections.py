@@ -248,7 +248,7 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(store.read_bytes(path))) as picture:
             return np.asarray(picture.convert("L"))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("a lane mask cannot be decoded", where=str(path), got=str(error)) from error
 
 

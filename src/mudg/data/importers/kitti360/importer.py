@@ -373,7 +373,7 @@ def _grey(path: Path) -> NDArray[Any]:
                 raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
                     expected="8 or 16 bits")  # fmt: skip
             array = np.array(image)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, EOFError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
     return array if array.dtype == np.uint8 else array.astype(np.uint16)
 

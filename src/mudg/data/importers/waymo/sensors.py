@@ -278,7 +278,7 @@ def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray
                     expected=f"{camera.width}x{camera.height}, 16 bits",
                     got=f"{image.width}x{image.height}, mode {image.mode}")  # fmt: skip
             return np.array(image).astype(np.int32)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
 
 

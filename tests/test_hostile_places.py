@@ -1,0 +1,82 @@
+"""Commands where the place is hostile: a current folder that is gone, limits of the shell, scenes that claim to be others."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mudg import cli
+from mudg.base.errors import InputError
+from mudg.data.city.config import CityConfig
+from mudg.data.scene import read_scene
+from mudg.stages import ingest
+from mudg.stages.config import IngestConfig
+from mudg.stages.score_truth import truth_of
+
+GONE = ["doctor", "fuse scene --out out", "view run", "convert a --to b", "run city --out out", "batch status out"]
+
+
+@pytest.mark.parametrize("words", GONE)
+def test_a_current_folder_that_is_gone_is_said(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert cli.main(words.split()) == 5
+    assert "the current folder is gone" in capsys.readouterr().err
+    assert cli.main(["--help"]) == 0
+
+
+LIMITED = """
+import resource, sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from mudg.base import processes
+import test_hostile_places
+if __name__ == "__main__":
+    resource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit}))
+    print(processes.run_limited(test_hostile_places.nothing, 64 << 30, Path("file"), test_hostile_places.never))
+"""
+
+
+def nothing() -> None:
+    """Work that needs nothing."""
+
+
+def never(_error: RuntimeError) -> bool:
+    """No error is want of memory."""
+    return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of address space")
+def test_a_limit_of_the_shell_below_our_own_is_kept(tmp_path: Path) -> None:
+    script = tmp_path / "limited.py"
+    script.write_text(LIMITED.format(tests=str(Path(__file__).parent), limit=8 << 30))
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout) > 0
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    tiny = CityConfig(n_frames=2, width=32, height=24, cameras=("front",), lidar_beams=4)
+    return read_scene(ingest.run(IngestConfig(city=tiny, contact_sheet=False), "city", tmp_path_factory.mktemp("city") / "scene"))
+
+
+@pytest.mark.parametrize("change", [
+    {"city": 3}, {"city": None}, {"city": []}, {"city": {}}, {"city": {"n_frames": -1}}, {"city": {"unknown": 1}},
+    {"generator_version": None}, {"n_frames": 2000}, {"seed": 1}, {"seed": 10**18}, {"light": "no"}, {"textures": "/nowhere"}, {},
+], ids=str)  # fmt: skip
+def test_a_scene_that_claims_to_be_another_city_has_no_truth(change: dict[str, Any], city: Any) -> None:
+    recipe = city.source.recipe
+    assert truth_of(city).exact
+    own = {"city", "generator_version"} & set(change)
+    changed = {**recipe, **change} if own else {**recipe, "city": {**recipe["city"], **change}} if change else {}
+    with pytest.raises(InputError):
+        truth_of(replace(city, source=replace(city.source, recipe=changed)))
