@@ -268,7 +268,8 @@ def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
         assert preset["written_bytes"] == sum(step["written_bytes"] for step in preset["steps"].values()) > 0
     for step in report["presets"]["cpu"]["default"]["steps"]:
         assert f"    {step} " in report["text"]
-    broken = doctor.report_scene(tmp_path)
+    (tmp_path / "empty").mkdir()
+    broken = doctor.report_scene(tmp_path / "empty")
     assert broken["presets"] == {}
     assert "--preset" not in broken["text"]
 

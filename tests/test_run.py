@@ -15,6 +15,7 @@ import pytest
 from mudg import cli
 from mudg.base import config as configuration
 from mudg.base import (
+    log,
     store,
     usage,
 )
@@ -103,6 +104,7 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
 def test_a_forecast_is_said_before_the_first_long_step(
     tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
+    log.set_quiet(False)
     run.run_chain(run_preset("fast"), "city", tmp_path / "out")
     said = capsys.readouterr().err
     assert said.index("== ingest") < said.index("forecast of scene") < said.index("== fuse")

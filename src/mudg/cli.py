@@ -511,6 +511,8 @@ def _called(verb: str, args: Any) -> dict[str, Any]:
         from mudg.stages.editing import runs
 
         given = {item.name: getattr(args, item.name) for item in fields(args) if item.name in runs.PARTS}
+        if verb == "score":
+            args = replace(args, views=tuple("=".join(map(str, _name_and_folder(item))) for item in args.views))
         required = {"adapt": ("fused", "fitted"), "synthesize": ("fused",), "render": ("model",)}.get(verb, ())
         if verb == "fit" and args.fused is None and args.settings.method != "emernerf" and not (args.scene / "scene.json").exists():
             required = ("fused",)

@@ -316,7 +316,7 @@ class RunDir:
                 remove_files(work, own(work))
             replacement.begin()
         run = cls(out, work, output, key, inputs)
-        run._seen = state if work == out else staged
+        run._seen = state if work == out else run_state(work)
         if work != out and staged.get("key") == key and _is_finished(work):
             _drop_lock_of_the_dead(work / _LOCK)
             run._take_place()
