@@ -306,7 +306,9 @@ COLUMNS = (
     "lidar_pc.filename", "lidar_pc.timestamp", "lidar_box.track_token", "lidar_box.yaw", "lidar_box.width", "track.token",
     "track.category_token", "category.name", "scene.name",
 )  # fmt: skip
-VALUES = ("CAST(x'ff80' AS TEXT)", "6000000000", "-1", "1.5", "NULL", "'text'", "''", "x'00ff'", "zeroblob(3000000)", "zeroblob(500000)", "9e999")
+VALUES = (
+    "CAST(x'ff80' AS TEXT)", "6000000000", "-1", "1.5", "NULL", "'text'", "''", "x'00ff'", "zeroblob(3000000)", "zeroblob(500000)", "9e999",
+)  # fmt: skip
 
 
 def without_types(database: Path, table: str) -> sqlite3.Connection:
