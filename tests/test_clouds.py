@@ -226,12 +226,11 @@ def test_lzf_noise_is_refused_or_has_the_length_asked_for(noise: bytes, length: 
 def test_every_header_field_of_a_pcd_may_be_wrong(key: str, value: str, kind: str) -> None:
     lines = pcd(kind).split(b"\n", 11)
     spoilt = [key.encode() + value.encode() if line.startswith(key.encode() + b" ") else line for line in lines]
-    try:
+    try:  # in words, or a cloud without a point or a field: nothing else may be raised
         columns = clouds.read_pcd(b"\n".join(spoilt), "a.pcd")
-    except InputError as error:
-        assert "a.pcd" in error.where
-    else:  # what is left is a cloud without a point, or without a field
-        assert all(len(values) in (0, 3) for values in columns.values())
+    except InputError:
+        columns = {}
+    assert all(len(values) in (0, 3) for values in columns.values())
 
 
 @pytest.mark.parametrize("value", ["", " x", " -1", " 1e9", " 9" * 30, " \u0663"])

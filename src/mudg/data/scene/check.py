@@ -177,7 +177,7 @@ def _check_ego(scene: Scene) -> Findings:
             yield _warning("ego path", f"the vehicle moves at {speed.max():.0f} m/s; check units of time and place")
     for gap in motion.gaps(ego.times_s, ego.world_from_ego):
         yield _warning("ego path", f"{gap}{'; frames in it would have guessed poses' if gap.is_guess else ''}")
-    yield from _check_keys("ego path", ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S, _JUMP_M)
+    yield from _check_keys("ego path", ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S, of_box=False)
     if scene.frames:
         first = scene.frames[0].view.center_world
         distance = float(np.linalg.norm(first - ego.world_from_ego[0, :3, 3]))
@@ -204,7 +204,7 @@ def check_distance(scene: Scene) -> Findings:
 
 
 def _check_keys(
-    where: str, times_s: NDArray[np.float64], poses: NDArray[np.float64], most_rad_s: float, jump_m: float
+    where: str, times_s: NDArray[np.float64], poses: NDArray[np.float64], most_rad_s: float, *, of_box: bool
 ) -> Findings:
     """Headings that flip, turns, jumps and accelerations that nothing on wheels makes: of each, how many and the first or largest."""
     if len(times_s) < 2:
@@ -225,7 +225,7 @@ def _check_keys(
             f"it turns by {np.rad2deg(angle[key]):.0f} degrees within {times_s[key + 1] - times_s[key]:.2f} s after "
             f"{times_s[key]:.3f} s (key {key}; {len(fast)} such turns); check headings and times",
         )
-    jumps = motion.jumps(times_s, poses, jump_m)
+    jumps = motion.jumps(times_s, poses, _TRACK_JUMP_M if of_box else _JUMP_M)
     if jumps:
         key, off_m, acceleration = jumps[0]
         yield _warning(
@@ -235,7 +235,7 @@ def _check_keys(
         )
         return
     key, acceleration = motion.largest_acceleration(times_s, poses)
-    if acceleration > motion.MOST_ACCELERATION_M_S2:
+    if acceleration > (motion.MOST_BOX_ACCELERATION_M_S2 if of_box else motion.MOST_ACCELERATION_M_S2):
         yield _warning(where, f"it accelerates by {acceleration:.0f} m/s^2 at {times_s[key]:.3f} s (key {key}); check poses and times")
 
 
@@ -283,7 +283,7 @@ def _check_tracks(scene: Scene) -> Findings:
             if speed.max() > MAX_SPEED_M_S:
                 yield _warning(where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
             most_rad_s = motion.most_turn_rad_s(track.label)
-            yield from _check_keys(where, track.times_s, track.world_from_object, most_rad_s, _TRACK_JUMP_M)
+            yield from _check_keys(where, track.times_s, track.world_from_object, most_rad_s, of_box=True)
             yield from _check_course(track, where)
         tilt = np.rad2deg(np.arccos(np.clip(track.world_from_object[:, 2, 2], -1, 1))).max()
         if tilt > 30:

@@ -38,6 +38,8 @@ MOST_TURN_RAD_S: Final = 2.0
 MOST_WALKER_TURN_RAD_S: Final = 8.0
 MOST_JUMP_M_S2: Final = 30.0
 MOST_ACCELERATION_M_S2: Final = 20.0
+MOST_BOX_ACCELERATION_M_S2: Final = 40.0
+"""Boxes that people drew jitter: those of a real log reach 21."""
 _ACCELERATION_OVER_S: Final = 0.2
 _VELOCITY_OVER_S: Final = 0.1
 _VELOCITY_WITHIN_S: Final = 1.0

@@ -87,8 +87,8 @@ class NuplanLog:
             # a delegated cursor would be closed after the database when a question is left unfinished
             for row in self._connection.execute(question, values):  # noqa: UP028
                 yield row
-        except (sqlite3.Error, OverflowError) as error:
-            raise InputError("log database is damaged", where=str(self.path), got=str(error),
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
+            raise InputError("log database is damaged", where=str(self.path), got=str(error)[:200],
                 remedy="copy the file again") from error  # fmt: skip
 
     def check(self) -> None:
