@@ -278,6 +278,38 @@ def test_flags_settings_paths_names_and_links_exist(page: Path) -> None:
     assert not wrong_lengths(page)
 
 
+def rows_after(text: str, heading: str) -> dict[str, list[str]]:
+    """Label -> cells of the table whose heading begins so, emphasis removed."""
+    table = text[text.index(heading) :].split("\n\n")[0].replace("*", "")
+    rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in table.splitlines()]
+    return {row[0]: row[1:] for row in rows}
+
+
+def test_the_numbers_of_the_readme_are_those_of_the_results() -> None:
+    """One version of every number: the README's table of the demo and its headline stand in docs/results.md, too."""
+    readme, results = ((REPOSITORY / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md"))
+    lines = readme[readme.index("| | recorded | 2 m") :].split("\n\n")[0].replace("*", "").splitlines()[2:]
+    columns = {"PSNR dB": "PSNR", "perceptual distance": "perceptual", "depth RMSE m": "RMSE m", "mIoU": "mIoU"}
+    measure, checked = "", 0
+    for line in lines:
+        label, *cells = (cell.strip() for cell in line.strip().strip("|").split("|"))
+        measure = label.split(":")[0] if ":" in label else measure
+        method = re.sub(r" \(.*| with the nearest", "", label.split(": ")[-1])
+        for cell, heading in zip(cells, ("| recorded path, held-out", "| 2 m |", "| 3 m |", "| 4 m |"), strict=True):
+            if cell:
+                table = rows_after(results, heading)
+                column = table[heading.strip("| ") if heading.endswith("|") else "recorded path, held-out frames"].index(columns[measure])
+                assert table[method][column] == cell, f"{measure} of {method} ({heading}): README {cell}"
+                checked += 1
+    assert checked == 39
+    gain = re.search(r"diffusion gains ([\d.]+) dB \(([\d.]+) to ([\d.]+)\)", readme)
+    assert gain, "the README's headline"
+    logs = re.search(r"PSNR \| \+([\d.]+) dB \([\d.]+; ([\d. ]+)\)", results)
+    assert logs, "the table of the eight logs"
+    each = [float(value) for value in logs[2].split()]
+    assert (gain[1], float(gain[2]), float(gain[3])) == (logs[1], min(each), max(each))
+
+
 def test_the_map_names_every_folder_of_the_package() -> None:
     text = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
     package = REPOSITORY / "src" / "mudg"

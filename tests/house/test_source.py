@@ -479,7 +479,7 @@ def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> No
         ("import torch\n", test_torch_is_not_imported_where_help_must_be_fast),
         ("x = 1\n" * (MAX_FILE_LINES + 1), test_files_and_functions_stay_short),
         ("def f():\n    'long'\n" + "    x = 1\n" * MAX_FUNCTION_LINES, test_files_and_functions_stay_short),
-        ("def f(a, b, c, d, e, *, g, h, i, j):\n    pass\n", test_functions_take_few_parameters),
+        (f"def f({', '.join(f'a{n}' for n in range(MAX_PARAMETERS + 1))}):\n    pass\n", test_functions_take_few_parameters),
         ("class Table:\n    pass\n\n\nclass Table:\n    pass\n", test_class_names_are_unique),
         ("def f():\n    from mudg.base import other\n", test_no_import_cycles_even_late_ones),
     ],
