@@ -67,7 +67,7 @@ class MudgError(Exception):
         self.what = short(what, 300)
         self.where = _listed(where, "/", 400)
         self.expected = _listed(expected, ", ", 1000)
-        self.got = _listed(got, "; ", 800)
+        self.got = _listed(got.replace("\n  ", "; "), "; ", 800)  # of an error that holds another one
         self.remedy = _CONTINUED.join(_listed(line, ", ", 1000) for line in remedy.split(_CONTINUED)[:100])
         super().__init__(self._text())
 
