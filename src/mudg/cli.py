@@ -93,7 +93,8 @@ def _convert(args: f.Convert) -> dict[str, Any]:
 def _adapt(args: f.Adapt) -> dict[str, Any]:
     from mudg.stages import adapt
 
-    return {"model": adapt.run(args.settings, args.scene, cast("Path", args.fused), cast("Path", args.fitted), args.out, overwrite=args.overwrite)}
+    fused, fitted = cast("Path", args.fused), cast("Path", args.fitted)
+    return {"model": adapt.run(args.settings, args.scene, fused, fitted, args.out, overwrite=args.overwrite)}
 
 
 def _synthesize(args: f.Synthesize) -> dict[str, Any]:
