@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mudg.base import failures, log, memory
 from mudg.base.errors import ResourceError, UsageError, nearest, plain, plain_lines
@@ -92,14 +92,15 @@ def _convert(args: f.Convert) -> dict[str, Any]:
 def _adapt(args: f.Adapt) -> dict[str, Any]:
     from mudg.stages import adapt
 
-    return {"model": adapt.run(args.settings, args.scene, args.fused, args.fitted, args.out, overwrite=args.overwrite)}
+    fused, fitted = cast("Path", args.fused), cast("Path", args.fitted)
+    return {"model": adapt.run(args.settings, args.scene, fused, fitted, args.out, overwrite=args.overwrite)}
 
 
 def _synthesize(args: f.Synthesize) -> dict[str, Any]:
     from mudg.stages import synthesize
 
     made = synthesize.run(
-        args.settings, args.scene, args.fused, args.out, fitted=args.fitted, edits=args.edits, overwrite=args.overwrite
+        args.settings, args.scene, cast("Path", args.fused), args.out, fitted=args.fitted, edits=args.edits, overwrite=args.overwrite
     )
     return {"views": made}
 
@@ -119,7 +120,7 @@ def _render(args: f.RenderFlags) -> dict[str, Any]:
     from mudg.stages import render
 
     made = render.run(
-        args.settings, args.scene, args.model, args.out, edits=args.edits, fused=args.fused, overwrite=args.overwrite
+        args.settings, args.scene, cast("Path", args.model), args.out, edits=args.edits, fused=args.fused, overwrite=args.overwrite
     )
     return {"views": made}
 

@@ -13,7 +13,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, make_dataclass
 from dataclasses import field as dataclass_field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_args, get_type_hints
 
 import tyro
 from pydantic import ValidationError
@@ -573,9 +573,11 @@ def _part_help(verb: str, part: str, description: str) -> Common:
 
     def kept(kind: type[Any], usual: Any) -> type[Any]:
         """A dataclass with the fields that apply; usual: an instance with their defaults, None for the verb's own flags."""
-        rows, hints = [], get_type_hints(kind, include_extras=True)
+        rows: list[Any] = []
+        hints = get_type_hints(kind, include_extras=True)
         for field in fields(kind):
-            text, shown, about = field.metadata.get("help", ""), hints[field.name], {"metadata": {"help": field.metadata.get("help", "")}}
+            text, shown = field.metadata.get("help", ""), hints[field.name]
+            about: dict[str, Any] = {"metadata": {"help": text}}
             own = usual is None and field.name in ("action", "name")
             if own or not _applies(verb, part, field.name, text, usual is not None):
                 continue
@@ -584,6 +586,7 @@ def _part_help(verb: str, part: str, description: str) -> Common:
             value = field.default if usual is None else getattr(usual, field.name)
             group = get_type_hints(kind)[field.name]
             if is_dataclass(group):
+                group = cast("type[Any]", group)
                 smaller = kept(group, group() if value is MISSING else value)
                 shown = Annotated[smaller, arg(name="")] if field.name == "settings" else smaller
                 rows += [(field.name, shown, dataclass_field(default_factory=smaller, **about))] if fields(smaller) else []

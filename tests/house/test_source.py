@@ -112,7 +112,7 @@ CONNECTS = {
     "torch.hub",
 }  # fmt: skip
 CONNECTING = {
-    "base/remote.py": {"fsspec"}, "stages/batches/on_ray.py": {"ray"}, "stages/learning/parallel.py": {"torch.distributed"},
+    "base/remote.py": {"fsspec", "ssl"}, "stages/batches/on_ray.py": {"ray"}, "stages/learning/parallel.py": {"torch.distributed"},
     "stages/viewing/server.py": {"http"}, "stages/viewing/view.py": {"http"},
 }  # fmt: skip
 """Modules that may reach a network, and what of. SECURITY.md tells when they do."""

@@ -27,6 +27,7 @@ from mudg.base.processes import process_alive
 from mudg.base.replacement import Replacement, all_names, remove_files
 from mudg.base.usage import Meter, Usage, folder_bytes
 
+fcntl: Any
 try:
     import fcntl
 except ImportError:  # Windows

@@ -25,14 +25,14 @@ INPUTS: Final = {
 VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthesize", "mudg_s": "render/mudg_s"}
 
 
-class Block(NamedTuple):
+class CommandBlock(NamedTuple):
     """Command lines that belong together, with a sentence on what they do."""
 
     title: str
     lines: tuple[str, ...]
 
 
-def next_commands(out: Path, source: str) -> list[Block]:
+def next_commands(out: Path, source: str) -> list[CommandBlock]:
     """What a run can be used for. Each block works by itself, in the folder from which the run was started."""
     run = str(out)
     scene, movable = scene_of(out, source), _first_object(out)
@@ -53,7 +53,7 @@ def next_commands(out: Path, source: str) -> list[Block]:
         ]),
         ("The same on your own log", [["run", "LOG", "--out", "runs/mine"]]),
     ]  # fmt: skip
-    return [Block(title, tuple(_line(words) for words in lines)) for title, lines in blocks]
+    return [CommandBlock(title, tuple(_line(words) for words in lines)) for title, lines in blocks]
 
 
 def step_commands(out: Path, source: str) -> list[str]:

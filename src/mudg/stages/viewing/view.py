@@ -151,7 +151,7 @@ def _inside(out: Path, run: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Sources:
+class ShownSources:
     """Where the log and the fits of a page lie. fits: (folder, whether it is part of a run). cloud: fused points, where they are known."""
 
     scene: Path
@@ -174,7 +174,7 @@ class Sources:
         return Shown(loaded, fits, None if self.cloud is None else read_fused(self.cloud))
 
 
-def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Sources:
+def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> ShownSources:
     """The log and the fits that a page is to show.
 
     Raises:
@@ -194,7 +194,7 @@ def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Pat
         if Path(compare).resolve() == Path(run).resolve():
             name = next((n for n, folder in others.fits.items() if folder != fits[0][0]), "")
         fits.append(_fit_of(others, name))
-    return Sources(place, tuple(fits), parts.fused)
+    return ShownSources(place, tuple(fits), parts.fused)
 
 
 def find_shown(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> Shown:
