@@ -32,8 +32,9 @@ def mudg(tmp_path):
 
     def run(line, before=""):
         done = subprocess.run(
-            [sys.executable, "-c", before + MAIN, *line.split()], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=1800
-        )
+            [sys.executable, "-c", before + MAIN, *line.split()],
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=1800,
+        )  # fmt: skip
         return done.returncode, done.stderr + done.stdout
 
     return run
