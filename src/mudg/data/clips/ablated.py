@@ -71,7 +71,7 @@ def conditions_of(
     if rules.published:
         whole = build_conditions(cloud, tracks, views, recorded, rules, kept)[0]
         if parts == "reference":
-            whole = replace(whole, valid=torch.zeros_like(whole.valid))
+            whole = replace(whole, valid=torch.zeros_like(whole.valid), measured=None)
         else:
             whole = replace(whole, reference_in="frame" if parts == "concat" else "nowhere")
         return whole, whole

@@ -17,11 +17,11 @@ Name = Annotated[str, Field(pattern=f"^{NAME_PATTERN.pattern}$")]
 """Becomes a part of a path."""
 
 
-class _Told(BaseModel):
+class BatchRecord(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore")
 
 
-class LogFacts(_Told):
+class RecordedFacts(BatchRecord):
     """Facts about a log, in the record of a step."""
 
     dataset: str = ""
@@ -32,7 +32,7 @@ class LogFacts(_Told):
     objects: dict[str, Count] = {}
 
 
-class StepTold(_Told):
+class StepTold(BatchRecord):
     """The end of a step, or an event of it."""
 
     event: str = ""
@@ -50,7 +50,7 @@ class StepTold(_Told):
     words: str = ""
     state: str = ""
     same: bool = False
-    facts: LogFacts | None = None
+    facts: RecordedFacts | None = None
 
 
 class Ended(StepTold):
@@ -60,7 +60,7 @@ class Ended(StepTold):
     stage: Name
 
 
-class ClaimTold(_Told):
+class ClaimTold(BatchRecord):
     """A claim."""
 
     state: str
@@ -70,17 +70,17 @@ class ClaimTold(_Told):
     counts: dict[Annotated[str, Field(pattern=r"^-?[0-9]{1,4}$")], Annotated[int, Field(ge=0, le=100)]] = {}
 
 
-class _Stage(_Told):
+class _Stage(BatchRecord):
     name: Name
 
 
-class PlanTold(_Told):
+class PlanTold(BatchRecord):
     """The plan."""
 
     stages: Annotated[list[_Stage], Field(min_length=1)]
 
 
-class ReviewTold(_Told):
+class ReviewTold(BatchRecord):
     """A result that waits for somebody to look at it."""
 
     scene: Name

@@ -39,8 +39,9 @@ class BenchOwn:
     eta: float | None = Field(default=None, ge=0, le=1)
     """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16:
+    published-type models on CUDA devices (shift, real, paper)."""
     harmonize: bool = False
     """edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them."""
     threads: int = Field(default=1, ge=1)
