@@ -95,7 +95,7 @@ class ReviewTold(BatchRecord):
 _REMEDY: Final = "remove it"
 
 
-def checked(kind: type[_Told], value: object, where: str, remedy: str = _REMEDY) -> Mapping[str, Any]:
+def checked(kind: type[BatchRecord], value: object, where: str, remedy: str = _REMEDY) -> Mapping[str, Any]:
     """A record, if it is one of this kind.
 
     Raises:
