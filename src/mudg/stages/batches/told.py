@@ -17,12 +17,12 @@ Name = Annotated[str, Field(pattern=f"^{NAME_PATTERN.pattern}$")]
 """Becomes a part of a path."""
 
 
-class BatchRecord(BaseModel):
+class _Record(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore")
 
 
-class RecordedFacts(BatchRecord):
-    """Facts about a log, in the record of a step."""
+class FactsTold(_Record):
+    """Facts about the log of a step."""
 
     dataset: str = ""
     cameras: Count = 0
@@ -32,7 +32,7 @@ class RecordedFacts(BatchRecord):
     objects: dict[str, Count] = {}
 
 
-class StepTold(BatchRecord):
+class StepTold(_Record):
     """The end of a step, or an event of it."""
 
     event: str = ""
@@ -50,7 +50,7 @@ class StepTold(BatchRecord):
     words: str = ""
     state: str = ""
     same: bool = False
-    facts: RecordedFacts | None = None
+    facts: FactsTold | None = None
 
 
 class Ended(StepTold):
@@ -60,7 +60,7 @@ class Ended(StepTold):
     stage: Name
 
 
-class ClaimTold(BatchRecord):
+class ClaimTold(_Record):
     """A claim."""
 
     state: str
@@ -70,17 +70,17 @@ class ClaimTold(BatchRecord):
     counts: dict[Annotated[str, Field(pattern=r"^-?[0-9]{1,4}$")], Annotated[int, Field(ge=0, le=100)]] = {}
 
 
-class _Stage(BatchRecord):
+class _Stage(_Record):
     name: Name
 
 
-class PlanTold(BatchRecord):
+class PlanTold(_Record):
     """The plan."""
 
     stages: Annotated[list[_Stage], Field(min_length=1)]
 
 
-class ReviewTold(BatchRecord):
+class ReviewTold(_Record):
     """A result that waits for somebody to look at it."""
 
     scene: Name
@@ -95,7 +95,7 @@ class ReviewTold(BatchRecord):
 _REMEDY: Final = "remove it"
 
 
-def checked(kind: type[BatchRecord], value: object, where: str, remedy: str = _REMEDY) -> Mapping[str, Any]:
+def checked(kind: type[_Record], value: object, where: str, remedy: str = _REMEDY) -> Mapping[str, Any]:
     """A record, if it is one of this kind.
 
     Raises:
