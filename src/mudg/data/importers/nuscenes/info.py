@@ -6,6 +6,7 @@ The file is the usual per-frame record of detection code bases, written as JSON:
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -35,8 +36,8 @@ def looks_like_info_frame(source: Path) -> bool:
     if not path.is_file() or path.stat().st_size > _MAX_RECOGNISED_BYTES:
         return False
     try:
-        meta = store.read_json(path)["metainfo"]
-    except (InputError, KeyError, TypeError, OSError):
+        meta = json.loads(store.read_bytes(path))["metainfo"]
+    except (ValueError, RecursionError, KeyError, TypeError, OSError):
         return False
     return isinstance(meta, dict) and str(meta.get("dataset", meta.get("DATASET", ""))).lower() == "nuscenes"
 

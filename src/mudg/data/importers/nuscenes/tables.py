@@ -1,13 +1,13 @@
 """The tables of a nuScenes release: JSON arrays of flat records, read one record at a time.
 
 The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each). What an
-import os
 import needs of them is one scene, so records are found by the value of one field while the file passes through a
 buffer of a few megabytes; only matching records become Python objects.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import re
@@ -20,9 +20,11 @@ from mudg.base.errors import InputError
 
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
-_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
-"""A flat object; braces may stand in its texts."""
-_FLAT: Final = re.compile(_RECORD, re.DOTALL)
+_FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
+"""An object whose fields are not objects; braces may stand in its texts."""
+_RECORD: Final = functools.reduce(lambda inner, _: _FLAT_RECORD.replace(rb')*+\}', b"|" + inner + rb')*+\}'), range(3), _FLAT_RECORD)
+"""An object with objects in it, three deep: the data set has none, but programs add fields of their own."""
+_FLAT: Final = re.compile(_FLAT_RECORD, re.DOTALL)
 _ENTRY: Final = re.compile(rb"\s*+(,?)\s*+(" + _RECORD + rb"|\])", re.DOTALL)
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
 
