@@ -87,3 +87,12 @@ def _one_torch_thread() -> Iterator[None]:
     yield
     if torch is not None and torch.get_num_threads() != before:
         torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def _loud() -> Iterator[None]:
+    """What a command with --quiet has switched off in this process is on again for the next test."""
+    yield
+    log = sys.modules.get("mudg.base.log")
+    if log is not None:
+        log.set_quiet(False)

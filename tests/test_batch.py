@@ -149,7 +149,8 @@ def test_a_folder_as_list_leaves_out_what_an_earlier_list_wrote_there(tmp_path: 
 
 
 def test_list_flags_alone_make_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["fuse", "scene", "--out", str(tmp_path / "o"), "--shard", "0/2"]) == 2
+    (tmp_path / "scene.json").write_text("{}")
+    assert cli.main(["fuse", str(tmp_path), "--out", str(tmp_path / "o"), "--shard", "0/2"]) == 2
     assert cli.main(["annotate", "--out", str(tmp_path / "o")]) == 2
-    assert cli.main(["fuse", "scene", "--list", "x", "--out", str(tmp_path / "o")]) == 2
+    assert cli.main(["fuse", str(tmp_path), "--list", "x", "--out", str(tmp_path / "o")]) == 2
     assert "not both" in capsys.readouterr().err

@@ -24,7 +24,7 @@ from mudg.data.edits import parse_edits
 from mudg.stages import annotate, fit, fuse, ingest
 from mudg.stages.config import AnnotateConfig, BenchConfig, FuseConfig, IngestConfig
 from mudg.stages.editing.runs import find_run
-from mudg.stages.fitting.storage import load_model, save_model
+from mudg.stages.fitting.storage import load_model
 
 FRAMES = 4
 
@@ -151,7 +151,7 @@ def test_two_drives_give_a_table_a_page_and_resume(
     assert len(rounds) == 5
 
 
-def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no fitted scene"):
         bench.run("edit", BenchConfig(), tmp_path / "a", sources=[tmp_path / "nothing"])
     with pytest.raises(InputError, match="of a fit alone"):
@@ -159,15 +159,12 @@ def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path) 
     with pytest.raises(UsageError, match="harmonize"):
         bench.run("edit", BenchConfig(harmonize=True), tmp_path / "a", sources=[run])
     assert not (tmp_path / "a").exists()
-    bare = tmp_path / "bare"
-    for part in ("scene", "fuse"):
-        (bare / part).parent.mkdir(exist_ok=True)
-        (bare / part).symlink_to(run / part)
     model = load_model(run / "fit" / "street_gaussians")
     parts = find_run(run)
-    save_model(replace(model, classes=()), bare / "fit" / "street_gaussians")
-    with pytest.raises(InputError, match="without labels"):
-        edit_runs.case_of("bare", find_run(bare), torch.device("cpu"))
+    with monkeypatch.context() as patch:
+        patch.setattr(edit_runs, "model_of_scene", lambda *_: replace(model, classes=()))
+        with pytest.raises(InputError, match="without labels"):
+            edit_runs.case_of("bare", parts, torch.device("cpu"))
     scene = edit_runs.case_of("street", parts, torch.device("cpu"))
     with pytest.raises(InputError, match="no vehicle moves"):
         edit_runs.lead_of(scene.scene, replace(model, nodes=model.nodes[:1]), scene.frames, scene.points)

@@ -260,7 +260,7 @@ def test_memory_and_disk_decide_which_presets_fit_this_machine() -> None:
 
 
 def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
-    report = doctor.report_scene(toy_views.write_scene(tmp_path / "scene"))
+    report = doctor.report_scene(toy_views.write_scene(tmp_path / "scene", lidar=True))
     for name in ("fast", "default", "quality", "paper"):
         assert f"--preset {name}" in report["text"]
         preset = report["presets"]["cpu"][name]

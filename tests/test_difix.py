@@ -91,7 +91,7 @@ def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with
     monkeypatch.setattr(chain.synthesize, "run", repaired)
     monkeypatch.setattr(chain.fit, "run", fitted)
     usual = FitConfig(method="mudg_s", iterations=100)
-    fits = FitChain(tmp_path, tmp_path / "scene", tmp_path / "fuse", usual, False, SynthesizeConfig(shifts_m=(3.0,)))
+    fits = FitChain(tmp_path, tmp_path / "scene", tmp_path / "fuse", usual, False, generator=SynthesizeConfig(shifts_m=(3.0,)))
     assert fits.fitted("difix", replace(usual, method="difix"), ()) == tmp_path / "fit" / "difix"
     first = "fit/street_gaussians"
     assert [entry for entry in done if entry[0] != "street_gaussians"] == [

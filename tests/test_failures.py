@@ -70,8 +70,8 @@ def test_errors_of_the_system_are_put_in_words(
     def fail(_args: object) -> dict[str, object]:
         raise made
 
-    monkeypatch.setitem(cli.VERBS, "render", dataclasses.replace(cli.VERBS["render"], call=fail))
-    assert cli.main(["render", "scene", "--model", "fit", "--out", "x"]) == 5
+    monkeypatch.setitem(cli.VERBS, "learn", dataclasses.replace(cli.VERBS["learn"], call=fail))
+    assert cli.main(["learn", "--out", "x"]) == 5
     said = capsys.readouterr().err
     assert what in said and "what to do" in said and "Traceback" not in said
 
@@ -85,9 +85,9 @@ def test_mistakes_of_the_program_stay_what_they_are(monkeypatch: pytest.MonkeyPa
     def fail(_args: object) -> dict[str, object]:
         raise KeyError("a")
 
-    monkeypatch.setitem(cli.VERBS, "render", dataclasses.replace(cli.VERBS["render"], call=fail))
+    monkeypatch.setitem(cli.VERBS, "learn", dataclasses.replace(cli.VERBS["learn"], call=fail))
     with pytest.raises(KeyError):
-        cli.main(["render", "scene", "--model", "fit", "--out", "x"])
+        cli.main(["learn", "--out", "x"])
 
 
 def test_an_allocation_that_cannot_succeed_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:

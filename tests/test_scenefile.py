@@ -415,7 +415,7 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
         "world_from_cam[3]",
         lambda d: d["frames"][2]["world_from_cam"].__setitem__(3, "x"),
     ),
-    "huge number": ("not finite", "time_s", lambda d: d["frames"][2].update(time_s=10**400)),
+    "huge number": ("beyond what a number can be", "", lambda d: d["frames"][2].update(time_s=10**400)),
     "true as number": ("not a number", "time_s", lambda d: d["frames"][2].update(time_s=True)),
     "zero focal length": ("focal length", "cameras.front.fx", lambda d: d["cameras"]["front"].update(fx=0)),
     "focal length in mm": ("focal length", "cameras.front.fy", lambda d: d["cameras"]["front"].update(fy=0.004)),

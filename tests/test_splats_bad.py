@@ -238,7 +238,7 @@ def set_rotation(document: dict[str, Any], **values: Any) -> None:
         (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "unevenly"),
         (lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "unevenly"),
         (lambda d: d["nodes"][0].update(translation=["a", 0, 0]), "no list of 3"),
-        (lambda d: d["nodes"][0].update(translation=[10**400, 0, 0]), "too large"),
+        (lambda d: d["nodes"][0].update(translation=[10**400, 0, 0]), "beyond what a number can be"),
         (lambda d: d["scenes"][0].update(nodes=[0] * 100), "no tree"),
         (lambda d: set_rotation(d, count=10**9), "not possible"),
         (lambda d: set_rotation(d, count=4), "beyond|differ"),

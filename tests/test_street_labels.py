@@ -302,7 +302,7 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
         street_net.load(tmp_path)
     for field, value, words in (
         ("widths", [8, 8, 8, 8, 9], r"widths\[4\]\n.*multiple of 8"), ("widths", "8", r"widths\n.*array"),
-        ("blocks", [1] * 4, "the field 4 is missing"), ("blocks", [1, 1, 1, 1, 10**9], r"blocks\[4\]\n.*1024"),
+        ("blocks", [1] * 4, "the field 4 is missing"), ("blocks", [1, 1, 1, 1, 10**9], r"blocks\[4\]\n.*65536"),
         ("temperature", 0, r"temperature\n.*greater than 0"), ("focal_px", "x", "value is not a number"), ("depth", 3, "unknown field"),
         ("widths", [8, 8, 8, 8, 16], "do not fit"),
     ):  # fmt: skip

@@ -489,11 +489,11 @@ def parse(verb: str, words: Sequence[str], description: str) -> Common:
         UsageError: unknown or invalid setting. InputError: --config cannot be read.
         SystemExit: --help (0), or an unknown or malformed flag (2); the message has been printed.
     """
-    if verb in CHAINS and {"-h", "--help"} & set(words):
+    part, short = next((word for word in words if not word.startswith("-")), ""), {"-h", "--help"} & set(words)
+    if part in PARTS.get(verb, {}) and (short or "--help-all" in words):
+        return _part_help(verb, part, description, CHAINS.get(verb, FLAGS[verb]) if short else FLAGS[verb])
+    if verb in CHAINS and short:
         return _own_help(verb, description)
-    part = next((word for word in words if not word.startswith("-")), "")
-    if part in PARTS.get(verb, {}) and {"-h", "--help", "--help-all"} & set(words):
-        return _part_help(verb, part, description)
     words = ["--help" if word == "--help-all" else word for word in words]
     words = _second_input_named(verb, words)
     flags = FLAGS[verb]
@@ -566,9 +566,8 @@ def _second_input_named(verb: str, words: Sequence[str]) -> Sequence[str]:
     return [words[0], flag, *words[1:]]
 
 
-def _part_help(verb: str, part: str, description: str) -> Common:
-    """Print the flags that a part of a verb has, such as ``batch status``: those whose text does not begin with the names of others."""
-    flags = FLAGS[verb]
+def _part_help(verb: str, part: str, description: str, flags: type[Common]) -> Common:
+    """Print those of ``flags`` that a part of a verb has, such as ``batch status``: those whose text names no other part."""
     _explain(flags, {})
 
     def kept(kind: type[Any], usual: Any) -> type[Any]:
