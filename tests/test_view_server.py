@@ -107,7 +107,7 @@ REQUESTS = {
     "a version of many digits": (b"GET / HTTP/1." + b"1" * 5000 + b"\r\n\r\n", b"400"),
     "a long line": (b"GET /" + b"x" * 70_000 + b" HTTP/1.1\r\n\r\n", b"414|"),
     "a long header": (b"GET / HTTP/1.1\r\nA: " + b"x" * 70_000 + b"\r\n\r\n", b"431|"),
-    "many headers": (b"GET / HTTP/1.1\r\n" + b"".join(b"A%d: 1\r\n" % n for n in range(1000)) + b"\r\n", b"431"),
+    "many headers": (b"GET / HTTP/1.1\r\n" + b"".join(b"A%d: 1\r\n" % n for n in range(1000)) + b"\r\n", b"431|"),
     "headers without a colon": (b"GET / HTTP/1.1\r\nnonsense\r\n: x\r\n\r\n", b"403"),
     "a token that is no text": (
         b"GET /?token=%ff%ed%a0%80 HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nX-Mudg-Token: \xff\xfe\r\nCookie: mudg_token=\xff;;\r\n\r\n", b"403",
