@@ -41,8 +41,8 @@ def measured(out: Path, count: int) -> dict[str, float]:
     ran = time.monotonic()
     Worker(request, perform=writes).run()
     again = time.monotonic()
-    code = "import sys,resource,time; b=time.monotonic(); from mudg import cli; "
-    code += "cli.main(['batch','status',sys.argv[1],'--html','--quiet']); "
+    code = "import sys,resource,time; b=time.monotonic(); from mudg import app; "
+    code += "app.main(['batch','status',sys.argv[1],'--html','--quiet']); "
     code += "print(time.monotonic()-b, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss/1024)"
     done = subprocess.run([sys.executable, "-c", code, str(out)], capture_output=True, text=True, check=True)
     seconds, mebibytes = map(float, done.stdout.splitlines()[-1].split())

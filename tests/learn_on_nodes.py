@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 
-from mudg import cli
+from mudg import app
 from mudg.stages import learn
 
 what, step_of_fault, rank_of_fault = (os.environ.get("FAULT") or "none:-1:-1").split(":")
@@ -21,4 +21,4 @@ def draw_with_fault(config, folder, step, *rest):
 
 
 learn.draw_clips = draw_with_fault
-sys.exit(cli.main(sys.argv[1:]))
+sys.exit(app.main(sys.argv[1:]))

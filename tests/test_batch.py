@@ -10,7 +10,7 @@ import kitti_folders as made
 import pytest
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base.errors import InputError, UsageError
 from mudg.data.scene import read_scene
 from mudg.stages.batches import lists
@@ -116,13 +116,13 @@ def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
         "--no-contact-sheet",
         "--quiet",
     ]
-    assert cli.main(words) == 11
+    assert app.main(words) == 11
     said = capsys.readouterr().out
     assert "1 of 2 scenes are there, 1 failed" in said and "cut off" in said
     assert len(read_scene(tmp_path / "scenes" / "first").frames) == 3
     assert not (tmp_path / "scenes" / "second" / "scene.json").exists()
     broken.write_bytes(content)
-    assert cli.main(words) == 0
+    assert app.main(words) == 0
     table = capsys.readouterr().out
     assert "reused" in table and "done" in table
     assert len(read_scene(tmp_path / "scenes" / "second").frames) == 6
@@ -136,9 +136,9 @@ def test_many_scenes_fused_by_shards(tmp_path: Path) -> None:
     first = [name for name in ("one", "two", "three") if lists.shard_of(name, 2) == 0]
     expected = sorted(["_batch", "status-0-of-2.json", *first])
     words = ["fuse", "--list", str(tmp_path / "scenes"), "--out", str(tmp_path / "fused"), "--quiet", "--shard"]
-    assert cli.main([*words, "0/2"]) == 0
+    assert app.main([*words, "0/2"]) == 0
     assert sorted(p.name for p in (tmp_path / "fused").iterdir()) == expected
-    assert cli.main([*words, "1/2"]) == 0
+    assert app.main([*words, "1/2"]) == 0
     assert (tmp_path / "fused" / "three" / "static.safetensors").is_file()
 
 
@@ -150,7 +150,7 @@ def test_a_folder_as_list_leaves_out_what_an_earlier_list_wrote_there(tmp_path: 
 
 def test_list_flags_alone_make_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "scene.json").write_text("{}")
-    assert cli.main(["fuse", str(tmp_path), "--out", str(tmp_path / "o"), "--shard", "0/2"]) == 2
-    assert cli.main(["annotate", "--out", str(tmp_path / "o")]) == 2
-    assert cli.main(["fuse", str(tmp_path), "--list", "x", "--out", str(tmp_path / "o")]) == 2
+    assert app.main(["fuse", str(tmp_path), "--out", str(tmp_path / "o"), "--shard", "0/2"]) == 2
+    assert app.main(["annotate", "--out", str(tmp_path / "o")]) == 2
+    assert app.main(["fuse", str(tmp_path), "--list", "x", "--out", str(tmp_path / "o")]) == 2
     assert "not both" in capsys.readouterr().err

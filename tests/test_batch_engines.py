@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 import slurm_here
 
-from mudg import cli
+from mudg import app
 from mudg.base.location import Location
 from mudg.stages.batches import status
 from mudg.stages.batches.folders import BatchFolder
@@ -75,7 +75,7 @@ def ends(out: Path) -> dict[str, str]:
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What one worker on this machine makes of the list."""
     made = ListOfScenes(tmp_path_factory.mktemp("undisturbed"))
-    assert cli.main(made.words(made.folder / "out", "--jobs", "1")) == 12
+    assert app.main(made.words(made.folder / "out", "--jobs", "1")) == 12
     found = ends(made.folder / "out")
     assert len(found) == SCENES and sorted(found.values()).count("3") == 2
     return found

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from mudg import cli
+from mudg import app
 from mudg.base.errors import InputError, UsageError
 from mudg.base.location import Location
 from mudg.stages import batch
@@ -149,13 +149,13 @@ def test_a_result_with_few_pictures_is_shown_with_those_it_was_made_of(tmp_path:
 
 def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert cli.main(["batch", "review", str(out)]) == 3
+    assert app.main(["batch", "review", str(out)]) == 3
     rejected(Location.of(out))
     capsys.readouterr()
-    assert cli.main(["batch", "review", str(out)]) == 0
+    assert app.main(["batch", "review", str(out)]) == 0
     assert "s0 command: x.json:n>=2: it is 0" in capsys.readouterr().out
-    assert cli.main(["batch", "accept", str(out), "--scenes", "s0", "s1"]) == 0
-    assert cli.main(["batch", "reject", str(out), "--scenes", "s0"]) == 3
+    assert app.main(["batch", "accept", str(out), "--scenes", "s0", "s1"]) == 0
+    assert app.main(["batch", "reject", str(out), "--scenes", "s0"]) == 3
     assert "nothing waits" in capsys.readouterr().err
     assert [entry.name for entry in read_list(out)] == ["s0", "s1", "s2", "s3"], (
         "neither records nor reviews are sources"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mudg import cli
+from mudg import app
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.stages import batch
@@ -101,7 +101,7 @@ def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
     assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
     assert flags["fuse"][-1] == "--quiet"
     for words in flags.values():
-        cli.parse(words[3:])
+        app.parse(words[3:])
 
 
 def test_a_scene_stays_in_its_shard_when_the_list_grows(tmp_path: Path) -> None:
@@ -482,7 +482,7 @@ def test_sigterm_leads_to_a_checkpoint_and_the_same_command_goes_on(tmp_path: Pa
     assert json.loads(claim.read_text())["counts"] == {"143": 1}
     assert next((tmp_path / "out/_batch/work").iterdir()).name.endswith(".left")
     (tmp_path / "up").unlink()
-    assert cli.main(words[3:]) == 0
+    assert app.main(words[3:]) == 0
     assert not (tmp_path / "up").exists()
     (record,) = done_records(tmp_path / "out").values()
     assert record["attempt"] == 2 and (tmp_path / "out" / record["place"] / "whole").is_file()
@@ -514,14 +514,14 @@ def test_last_words() -> None:
 
 
 def test_the_command_line_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["batch", "status", str(tmp_path)]) == 3
-    assert cli.main(["batch", "run", "--out", str(tmp_path / "o")]) == 2
+    assert app.main(["batch", "status", str(tmp_path)]) == 3
+    assert app.main(["batch", "run", "--out", str(tmp_path / "o")]) == 2
     (tmp_path / "list.txt").write_text("city\n")
     words = ["batch", "run", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "o")]
-    assert cli.main([*words, "--max-failures", "many"]) == 2
-    assert cli.main([*words, "--set", "fit.iterationz=3"]) == 2
+    assert app.main([*words, "--max-failures", "many"]) == 2
+    assert app.main([*words, "--set", "fit.iterationz=3"]) == 2
     assert "did you mean fit.iterations" in capsys.readouterr().err
-    assert cli.main([*words, "--stages", "ingest", "fuse", "--dry-run"]) == 0
+    assert app.main([*words, "--stages", "ingest", "fuse", "--dry-run"]) == 0
     assert "1 scenes: ingest -> fuse" in capsys.readouterr().out
     assert not (tmp_path / "o").exists()
 
@@ -587,7 +587,7 @@ def test_templates_follow_their_schemas_and_start_a_batch() -> None:
     spec = job["spec"]
     pod, (container,) = spec["template"]["spec"], spec["template"]["spec"]["containers"]
     words = [*container["command"], *container["args"]]
-    parsed = cli.parse(words[1:])
+    parsed = app.parse(words[1:])
     assert parsed.settings.engine == "env" and parsed.settings.shards == spec["completions"]
     assert pod["terminationGracePeriodSeconds"] > parsed.settings.grace_s
     rules = [rule["onExitCodes"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule]
@@ -596,7 +596,7 @@ def test_templates_follow_their_schemas_and_start_a_batch() -> None:
     task = yaml.safe_load((EXAMPLES / "batch_skypilot.yaml").read_text())
     assert differs(task, SKYPILOT) == []
     line = next(line for line in task["run"].splitlines() if line.startswith("mudg"))
-    assert cli.parse(line.split()[1:]).settings.engine == "env"
+    assert app.parse(line.split()[1:]).settings.engine == "env"
     assert differs({"a": 1, "c": "x"}, {"a": str, "b": int}) == [".c", ".b is missing", ".a: 1"]
 
 

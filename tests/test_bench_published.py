@@ -10,6 +10,7 @@ import torch
 from test_score_metrics import lpips_state
 from toy_published import write_tiny
 
+from mudg.app import parse
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import UsageError
@@ -18,7 +19,6 @@ from mudg.bench import shift
 from mudg.bench.chain import LONGER, method_fit
 from mudg.bench.paper_tables import RECORDED, TABLES
 from mudg.bench.shift import rows_of
-from mudg.cli import parse
 from mudg.data.city.config import CityConfig
 from mudg.data.city.logs import LogRules
 from mudg.data.clips.ablated import ConditionSources, conditions_of

@@ -12,7 +12,7 @@ import toy_vit
 from test_i3d import made_up, renamed
 from test_score_metrics import lpips_state
 
-from mudg import cli
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.models import i3d, inception
@@ -88,10 +88,10 @@ def test_other_networks_are_refused_and_nothing_is_written(tmp_path: Path) -> No
 def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path) -> None:
     checkpoint = saved(tmp_path, "dinov2")
     to = tmp_path / "weights" / "dino"
-    assert cli.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) == 0
+    assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) == 0
     assert (to / "weights.safetensors").is_file()
-    assert cli.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) != 0
-    assert cli.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2", "--overwrite"]) == 0
+    assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) != 0
+    assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2", "--overwrite"]) == 0
     with pytest.raises(UsageError, match="diffusion models only"):
         convert.run(ConvertConfig(network="dinov2", dtype="float16"), checkpoint, tmp_path / "other")
     with pytest.raises(InputError, match="no such checkpoint"):

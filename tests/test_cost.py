@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import inspect
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import toy_views
 
-from mudg import flags, native
 from mudg.base import store
-from mudg.core.raster import probe
-from mudg.stages import doctor
 from mudg.stages.config import RunConfig, cost, run_preset
+from mudg.steps.run import Demo, Run
+from mudg.steps.step import texts_of
 
 DEMO = cost.SceneSize(images=72, path_images=24, width=384, height=256, points=100_600)
 """What `mudg demo` makes."""
@@ -171,122 +166,4 @@ def test_what_the_flags_promise_of_fast_is_what_is_forecast_and_was_measured() -
     assert 1 / cost.FACTOR < sum(step.processor_s or 0 for step in found.steps.values()) / measured_s < cost.FACTOR
     demo = cost.estimate(run_preset("fast"), FAST, cost.Machine(2)).total_s
     assert demo is not None and 60 / cost.FACTOR < demo < 60 * cost.FACTOR
-    assert "One to two minutes on 2 cores" in (help_of(flags.RunOwn)) and "about a minute on 2 cores" in help_of(flags.DemoOwn)
-
-
-def help_of(kind: type) -> str:
-    """The text below the field ``fast``."""
-    return " ".join(inspect.getsource(kind).partition("fast: Flag")[2].split('"""')[1].split())
-
-
-def test_a_line_says_what_a_run_will_take_here() -> None:
-    config = run_preset("fast")
-    log = cost.SceneSize(images=16, path_images=16, width=480, height=145, points=31_336, exact=False, labelled=False, adapts=True)
-    idle, now, half = (cost.estimate(config, log, cost.Machine(2, speed)) for speed in (1.0, 0.9, 0.25))
-    assert idle.total_s is not None
-    seconds = int(cost.in_a_line(idle, now).partition("about ")[2].split()[0])
-    assert seconds == pytest.approx(idle.total_s, abs=1)
-    assert "busy" not in cost.in_a_line(idle, now) and "if it stays as busy as it is now" in cost.in_a_line(idle, half)
-    paper = cost.estimate(run_preset("paper"), log, cost.Machine(2))
-    assert "and synthesize (not measured)" in cost.in_a_line(paper, paper)
-    assert "time not measured" in cost.in_a_line(*[cost.estimate(config, log, cost.Machine(2), "cuda")] * 2)
-
-
-def test_a_log_without_labels_is_annotated_and_adapted_to() -> None:
-    """Steps that a generated city does not need are counted where they are taken, in the order in which they come."""
-    log = replace(DEMO, exact=False, labelled=False, adapts=True)
-    found = cost.estimate(run_preset(), log, cost.Machine(2)).steps
-    assert list(found)[:4] == ["annotate", "fuse", "fit without diffusion", "adapt"]
-    assert all(step.seconds and step.memory_bytes and step.written_bytes for step in found.values())
-    off = replace(run_preset(), adaptation="off")
-    assert "adapt" not in cost.estimate(off, log, cost.Machine(2)).steps
-    assert not {"annotate", "adapt"} & set(cost.estimate(run_preset(), DEMO, cost.Machine(2)).steps)
-    row = next(line for line in cost.in_words(cost.of_presets(log, cost.Machine(2)), 0) if line.strip().startswith("adapt "))
-    assert row.count("not taken") == 2, "the presets fast and paper do not adapt"
-    longer = cost.estimate(run_preset(), replace(log, images=144, path_images=48), cost.Machine(2)).steps
-    assert all((longer[name].processor_s or 0) > (found[name].processor_s or 0) for name in ("annotate", "adapt"))
-
-
-def test_the_probe_measures_this_machine() -> None:
-    speed = probe.speed(1, for_s=0.05)
-    assert 0.001 < speed.now <= speed.idle < 30
-
-
-def test_the_probe_sees_a_machine_of_half_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = {"now": 0.0}
-
-    def one_pass(*_given: object) -> None:
-        clock["now"] += 2 * probe.REFERENCE_S
-
-    monkeypatch.setattr(probe, "one_pass", one_pass)
-    monkeypatch.setattr("time.perf_counter", lambda: clock["now"])
-    assert probe.speed(1) == pytest.approx((0.5, 0.5))
-    assert probe.speed(2).now == pytest.approx(0.5 * (1 - probe.SHARED / 2))
-
-
-def test_a_step_of_the_benchmark_is_met() -> None:
-    """82.4 ms at 75,000 Gaussians and 480x320 on one core (bench/README.md)."""
-    assert 1e3 * (75_000 * cost.GAUSSIAN_STEP_S + 480 * 320 * cost.PIXEL_STEP_S) == pytest.approx(82.4, rel=0.1)
-
-
-def test_what_was_not_measured_has_no_number() -> None:
-    paper = cost.estimate(run_preset("paper"), DEMO, cost.Machine(2))
-    assert paper.seconds["synthesize"] is None
-    assert paper.total_s is None
-    on_card = cost.estimate(run_preset(), DEMO, cost.Machine(2), "cuda")
-    assert on_card.total_s is None
-    assert on_card.memory_bytes > 0
-    text = "\n".join(cost.in_words(cost.of_presets(DEMO, cost.Machine(2), "cuda"), 0, "cuda"))
-    assert "time not measured" in text
-    assert "fit into" not in text
-
-
-def test_free_memory_decides_what_fits() -> None:
-    found = cost.of_presets(DEMO, cost.Machine(1))
-    needs = found["default"].memory_bytes
-    text = cost.in_words(found, needs)
-    assert "fits" in next(line for line in text if "default" in line)
-    assert "does NOT fit" in next(line for line in cost.in_words(found, needs - 1) if "default" in line)
-
-
-def test_memory_and_disk_decide_which_presets_fit_this_machine() -> None:
-    found = cost.of_presets(DEMO, cost.Machine(1))
-    enough = found["default"].memory_bytes, found["default"].written_bytes
-    last = [line for line in cost.in_words(found, enough[0], "cpu", enough[1]) if "suffice for" in line]
-    assert len(last) == 1 and "default" in last[0] and "quality" not in last[0] and "paper" not in last[0]
-    text = "\n".join(cost.in_words(found, enough[0], "cpu", 10))
-    assert "suffice for: none" in text and "NOT free here" in text
-    assert "suffice" not in "\n".join(cost.in_words(found, 0))
-
-
-def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
-    report = doctor.report_scene(toy_views.write_scene(tmp_path / "scene", lidar=True))
-    for name in ("fast", "default", "quality", "paper"):
-        assert f"--preset {name}" in report["text"]
-        preset = report["presets"]["cpu"][name]
-        assert preset["memory_bytes"] == max(step["memory_bytes"] for step in preset["steps"].values()) > 0
-        assert preset["written_bytes"] == sum(step["written_bytes"] for step in preset["steps"].values()) > 0
-    for step in report["presets"]["cpu"]["default"]["steps"]:
-        assert f"    {step} " in report["text"]
-    (tmp_path / "empty").mkdir()
-    broken = doctor.report_scene(tmp_path / "empty")
-    assert broken["presets"] == {}
-    assert "--preset" not in broken["text"]
-
-
-@pytest.mark.slow
-def test_a_real_run_is_forecast(tmp_path: Path) -> None:
-    """Processor seconds, memory and bytes of every step; the clock of a shared machine says little."""
-    command = [sys.executable, "-m", "mudg", "run", "city", "--preset", "fast", "--out", str(tmp_path / "out"), "--quiet"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # a process of its own: what earlier tests took would count
-    steps = store.read_json(tmp_path / "out" / "run.json")["steps"]
-    cores = native.default_threads()
-    speed = max(probe.speed(cores).idle for _ in range(5))  # other programs at work lower it
-    found = cost.estimate(run_preset("fast"), FAST, cost.Machine(cores, speed))
-    for name, forecast in found.steps.items():
-        measured = steps[name]
-        assert forecast.written_bytes == pytest.approx(measured["written_bytes"], rel=0.5, abs=1e6), name
-        assert 0.5 < forecast.memory_bytes / measured["peak_bytes"] < 2, name
-    total_s = sum(step["processor_s"] for name, step in steps.items() if name != "ingest")
-    forecast_s = sum(step.processor_s or 0 for step in found.steps.values())
-    assert 0.5 < forecast_s / total_s < 2
+    assert "One to two minutes on 2 cores" in texts_of(Run)["fast"] and "about a minute on 2 cores" in texts_of(Demo)["fast"]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import pytest
 
-from mudg import cli, native
+from mudg import app, native
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -86,7 +86,7 @@ def run_command(command: str) -> None:
     """Run ``mudg ...`` or ``python FILE.py ...`` in this process; a failure raises."""
     program, *arguments = shlex.split(command, comments=True)
     if program == "mudg":
-        assert cli.main(arguments) == 0, command
+        assert app.main(arguments) == 0, command
     else:
         assert program == "python", f"a console example starts mudg or a script of the repository: {command}"
         before, path = sys.argv, list(sys.path)
@@ -330,7 +330,7 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
     assert unknown_paths("`stages/no_such.py` `no_such.py` `models/no_such/`") == [
         "stages/no_such.py", "no_such.py", "models/no_such/",
     ]  # fmt: skip
-    assert not unknown_paths("`stages/fit.py` `src/mudg/cli.py` `models/mdm/`")
+    assert not unknown_paths("`stages/fit.py` `src/mudg/app.py` `models/mdm/`")
     page = tmp_path / "page.md"
     page.write_text("# One head\n[a](other.md) [b](#one-head) [c](#two)", encoding="utf-8")
     assert broken_links(page) == ["other.md", "#two"]

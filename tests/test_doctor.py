@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import toy_views
 
-from mudg import cli
+from mudg import app
 from mudg.data.exporters import video
 from mudg.stages import doctor
 
@@ -43,7 +43,7 @@ def test_a_missing_encoder_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_good_scene_is_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
-    assert cli.main(["doctor", str(scene)]) == 0
+    assert app.main(["doctor", str(scene)]) == 0
     assert "can be used" in capsys.readouterr().out
 
 
@@ -51,7 +51,7 @@ def test_a_truncated_image_is_found_and_named(tmp_path: Path, capsys: pytest.Cap
     scene = toy_views.write_scene(tmp_path / "scene")
     image = scene / "images" / "front" / "000002.png"
     image.write_bytes(image.read_bytes()[:100])
-    assert cli.main(["doctor", str(scene)]) == 3
+    assert app.main(["doctor", str(scene)]) == 3
     out = capsys.readouterr().out
     assert "000002" in out
     assert "cannot be used" in out
@@ -60,14 +60,14 @@ def test_a_truncated_image_is_found_and_named(tmp_path: Path, capsys: pytest.Cap
 def test_scene_findings_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     (scene / "images" / "front" / "000001.png").unlink()
-    assert cli.main(["doctor", str(scene), "--json"]) == 3
+    assert app.main(["doctor", str(scene), "--json"]) == 3
     result = json.loads(capsys.readouterr().out)
     assert result["usable"] is False
     assert any(f["level"] == "error" and "000001" in f["where"] + f["words"] for f in result["findings"])
 
 
 def test_no_scene_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["doctor", str(tmp_path / "nothing")]) == 3
+    assert app.main(["doctor", str(tmp_path / "nothing")]) == 3
     assert "does not exist" in capsys.readouterr().out
 
 
@@ -77,8 +77,8 @@ def test_a_log_in_the_neutral_layout_is_checked_and_other_logs_are_told_apart(
     log = tmp_path / "log"
     log.mkdir()
     (log / "log.json").write_text('{"format": "mudg-log", "version": 1, "name": "x"}')
-    assert cli.main(["doctor", str(log)]) == 3
+    assert app.main(["doctor", str(log)]) == 3
     assert "the field 'licence' is missing" in capsys.readouterr().out
     (tmp_path / "drive" / "image_02").mkdir(parents=True)
-    assert cli.main(["doctor", str(tmp_path / "drive")]) == 3
+    assert app.main(["doctor", str(tmp_path / "drive")]) == 3
     assert "this is a log (kitti), not a scene" in capsys.readouterr().out

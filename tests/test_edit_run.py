@@ -12,7 +12,7 @@ from fit_settings import fit_config
 from toy_world import CAR_SIZE, car_pose, ego_pose, fused_cloud, write_scene
 
 import mudg
-from mudg import cli, verbs
+from mudg import app
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
@@ -180,18 +180,18 @@ def test_results_are_reused_refused_and_resumed(run: Path, tmp_path: Path, monke
 
 def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "shelf" / "red.safetensors"
-    assert cli.main(["asset", "export", str(run), "car", "--out", str(file)]) == 0
-    assert verbs.export_asset(run, "car", file) == file  # the same again: verified
+    assert app.main(["asset", "export", str(run), "car", "--out", str(file)]) == 0
+    assert mudg.export_asset(run, "car", out=file) == file  # the same again: verified
     with pytest.raises(UsageError, match="exists"):
-        verbs.export_asset(run / "fit" / "street_gaussians", "car", file)  # without its scene
+        mudg.export_asset(run / "fit" / "street_gaussians", "car", out=file)  # without its scene
     with pytest.raises(UsageError, match="no dynamic object"):
-        verbs.export_asset(run, "nobody", tmp_path / "x.safetensors")
+        mudg.export_asset(run, "nobody", out=tmp_path / "x.safetensors")
     text = """
 - insert: {asset: {file: shelf/red.safetensors}, id: second, near: {id: ego, at_s: 0, ahead_m: 14, left_m: 2, yaw_deg: 180}}
 - replace: {id: car, by: {run: RUN, id: car}}
 """.replace("RUN", str(run))
     out = tmp_path / "out"
-    assert cli.main(["edit", str(run), str(script(tmp_path, text)), "--out", str(out), "--quiet"]) == 0
+    assert app.main(["edit", str(run), str(script(tmp_path, text)), "--out", str(out), "--quiet"]) == 0
     assert "edited" in capsys.readouterr().out
     scene, fused = read_scene(out / "scene"), read_fused(out / "fuse")
     assert {track.id for track in scene.tracks} == {"car", "second"}
@@ -247,7 +247,7 @@ def test_from_python(run: Path, tmp_path: Path) -> None:
     edits = script(tmp_path, "- stop: {id: car, at_s: 0.3}")
     stopped = fitted.edited(edits, scene)
     assert stopped.object_pose("car", 0.9)[0, 3] < fitted.object_pose("car", 0.9)[0, 3] - 0.5
-    made = verbs.edit(run / "fit" / "street_gaussians", edits, tmp_path / "out", scene=run / "scene")
+    made = mudg.edit(run / "fit" / "street_gaussians", edits, out=tmp_path / "out", scene=run / "scene")
     view = scene.frames[2].view
     pictures = [s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))]
     assert np.array_equal(*pictures)

@@ -19,7 +19,7 @@ from test_edit import SIZE, toy
 from test_edit import view as toy_view
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import View
@@ -168,15 +168,15 @@ def fit(tmp_path: Path) -> Path:
 
 def test_the_verb_writes_a_file_and_what_it_is(fit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a.spz"
-    assert cli.main(["export", "spz", str(fit), "--out", str(out), "--time-s", "0.5"]) == 0
+    assert app.main(["export", "spz", str(fit), "--out", str(out), "--time-s", "0.5"]) == 0
     said = capsys.readouterr().err
     assert "spz does not hold motion (car-1 as at 0.5 s)" in said and "classes" in said and "sky" in said
     about = json.loads((tmp_path / "a.spz.json").read_text())
     assert about["gaussians"] == 690 and about["time_s"] == 0.5 and about["file_from_world"][0] == [0, -1, 0, 0]
     assert len(about["not_in_the_file"]) == 3 and about["bytes"] == out.stat().st_size
-    assert cli.main(["export", "spz", str(fit), "--out", str(out)]) == 2  # it exists
+    assert app.main(["export", "spz", str(fit), "--out", str(out)]) == 2  # it exists
     before = out.read_bytes()
-    assert cli.main(["export", "spz", str(fit), "--out", str(out), "--time-s", "0.5", "--overwrite"]) == 0
+    assert app.main(["export", "spz", str(fit), "--out", str(out), "--time-s", "0.5", "--overwrite"]) == 0
     assert out.read_bytes() == before
 
 
@@ -241,7 +241,7 @@ def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_
     turned = replace(scene, file_from_world=formats.file_from_world(name, "viewer"))
     file.write_bytes(formats.FORMATS[name].write(formats.WriteRequest(turned, 0.0)))
     flags = ["--label", "van", "--length-m", "5", "--yaw-deg", "90", "--out", str(tmp_path / "a.safetensors")]
-    assert cli.main(["asset", "import", str(file), *flags]) == 0
+    assert app.main(["asset", "import", str(file), *flags]) == 0
     asset = read_asset(tmp_path / "a.safetensors")
     assert asset.label == "van" and abs(asset.size_m[0] - 5) < 1e-3 and set(asset.class_ids.tolist()) == {13}
     means = asset.columns["means"].numpy()
@@ -302,9 +302,9 @@ def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="ends in .safetensors"):
         imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.ply")
     assert (
-        cli.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
+        app.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
     )
-    assert cli.main(["asset", "export", str(tmp_path), "--out", str(tmp_path / "a.safetensors")]) == 2
+    assert app.main(["asset", "export", str(tmp_path), "--out", str(tmp_path / "a.safetensors")]) == 2
     assert not (tmp_path / "a.safetensors").exists()
 
 
@@ -426,7 +426,7 @@ def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkey
     monkeypatch.setattr(mcap, "CHUNK_BYTES", 20_000)  # several chunks
     street = ToyStreet(times=[0.5, 0.6, 0.7], car_start=(8.0, 1.0), car_velocity=(3.0, 0.0))
     scene = street.write(tmp_path / "scene", width=24, height=12)
-    assert cli.main(["export", "mcap", str(tmp_path / "scene"), "--out", str(tmp_path / "a.mcap")]) == 0
+    assert app.main(["export", "mcap", str(tmp_path / "scene"), "--out", str(tmp_path / "a.mcap")]) == 0
     content = (tmp_path / "a.mcap").read_bytes()
     magic = b"\x89MCAP0\r\n"
     assert content.startswith(magic) and content.endswith(magic)

@@ -16,7 +16,7 @@ from test_edit import toy
 from test_export import records, text_of
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, ResourceError
 from mudg.base.types import PointCloud, Scene
@@ -126,7 +126,7 @@ def matrix(transform: dict[str, Any]) -> np.ndarray:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, Path]:
     folder = tmp_path_factory.mktemp("bag")
     scene = street(folder / "scene")
-    assert cli.main(["export", "ros2", str(folder / "scene"), "--out", str(folder / "out")]) == 0
+    assert app.main(["export", "ros2", str(folder / "scene"), "--out", str(folder / "out")]) == 0
     return scene, folder
 
 
@@ -238,7 +238,7 @@ def test_the_same_log_gives_the_same_bag_in_bounded_memory(
     first = hashlib.sha256((folder / "out" / "log_0.mcap").read_bytes()).hexdigest()
     blocks = mcap.McapBlocks(ros2.Ros2Messages(log_of(scene)), f"mudg {export.version()}", ros2.dialect())
     assert hashlib.sha256(b"".join(blocks)).hexdigest() == first
-    assert cli.main(["export", "ros2", str(folder / "scene"), "--out", str(folder / "out")]) == 0  # verified and reused
+    assert app.main(["export", "ros2", str(folder / "scene"), "--out", str(folder / "out")]) == 0  # verified and reused
     assert hashlib.sha256((folder / "out" / "log_0.mcap").read_bytes()).hexdigest() == first
     read: list[str] = []
     log = log_of(scene)
@@ -271,7 +271,7 @@ def test_rerun_names_its_extra_where_it_is_missing(tmp_path: Path, monkeypatch: 
     with pytest.raises(ResourceError, match=r"mudg\[rerun\]"):
         export.run(ExportConfig(), "rerun", tmp_path / "fit", tmp_path / "a.rrd")
     assert not (tmp_path / "a.rrd").exists()
-    assert cli.main(["export", "rerun", str(tmp_path / "fit"), "--out", str(tmp_path / "a.mcap")]) != 0
+    assert app.main(["export", "rerun", str(tmp_path / "fit"), "--out", str(tmp_path / "a.mcap")]) != 0
 
 
 def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:

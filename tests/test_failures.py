@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
 import os
 import signal
@@ -18,10 +17,11 @@ import pytest
 import torch
 from test_hostile_files import ends_within
 
-from mudg import cli
+from mudg import app
 from mudg.base import failures, log, memory
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.processes import run_in_processes
+from mudg.steps.learn import Learn
 
 FULL = Path("/dev/full")
 needs_full_device = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
@@ -70,8 +70,8 @@ def test_errors_of_the_system_are_put_in_words(
     def fail(_args: object) -> dict[str, object]:
         raise made
 
-    monkeypatch.setitem(cli.VERBS, "learn", dataclasses.replace(cli.VERBS["learn"], call=fail))
-    assert cli.main(["learn", "--out", "x"]) == 5
+    monkeypatch.setattr(Learn, "run", fail)
+    assert app.main(["learn", "--out", "x"]) == 5
     said = capsys.readouterr().err
     assert what in said and "what to do" in said and "Traceback" not in said
 
@@ -85,9 +85,9 @@ def test_mistakes_of_the_program_stay_what_they_are(monkeypatch: pytest.MonkeyPa
     def fail(_args: object) -> dict[str, object]:
         raise KeyError("a")
 
-    monkeypatch.setitem(cli.VERBS, "learn", dataclasses.replace(cli.VERBS["learn"], call=fail))
+    monkeypatch.setattr(Learn, "run", fail)
     with pytest.raises(KeyError):
-        cli.main(["learn", "--out", "x"])
+        app.main(["learn", "--out", "x"])
 
 
 def test_an_allocation_that_cannot_succeed_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from faults import contents, failing, in_child, killed, points, terminated
 from test_nothing_is_lost import HISTORY, VERBS, quick_bench, world  # noqa: F401
 from toy_clips import tiny, write_clips
 
-from mudg import cli
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import ResourceError
 from mudg.base.replacement import Replacement
@@ -159,7 +159,7 @@ def test_a_verb_stopped_at_any_point_is_repeated_to_the_same_bytes(
     given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
 
     def work(out: Path) -> Any:
-        with cli._sigterm_interrupts():
+        with app._sigterm_interrupts():
             return VERBS[name].call(given, out, 1, False)
 
     work(tmp_path / "whole")
@@ -202,7 +202,7 @@ def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dic
 
 def small_training(clips: Path, out: Path) -> Path:
     """``mudg learn`` in a moment: codec, steps, checkpoints, scores, model; stops on SIGTERM as the command does."""
-    with cli._sigterm_interrupts():
+    with app._sigterm_interrupts():
         return learn.run(tiny(clips), out)
 
 

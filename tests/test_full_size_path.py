@@ -19,7 +19,7 @@ from mudg.stages.config import PRESETS
 
 TOY = "import sys; from toy_published import TINY; from mudg.stages import convert; convert.PublishedConfig = lambda: TINY\n"
 """Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""
-MAIN = "from mudg.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+MAIN = "from mudg.app import main; import sys; sys.exit(main(sys.argv[1:]))"
 OWN = {"synthesize.model", "fit.iterations", "fit.virtual.lpips_weights"}
 """What the command line of the table gives itself."""
 

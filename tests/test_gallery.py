@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, NO_BROWSER, Browser
 
-from mudg import cli, verbs
+import mudg
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.stages.viewing import gallery
@@ -96,13 +97,13 @@ def test_hostile_names_are_shown_as_text(tmp_path: Path) -> None:
 def test_a_page_is_replaced_on_demand_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = run_of(tmp_path / "run")
     out = tmp_path / "all.html"
-    assert verbs.report([run], out) == out
-    assert verbs.report([run], out) == out  # the same again: verified
+    assert mudg.report([run], out=out) == out
+    assert mudg.report([run], out=out) == out  # the same again: verified
     with pytest.raises(UsageError, match="exists"):
-        verbs.report([run, run_of(tmp_path / "another")], out)
+        mudg.report([run, run_of(tmp_path / "another")], out=out)
     with pytest.raises(UsageError, match="HTML"):
-        verbs.report([run], tmp_path / "all.pdf")
-    assert cli.main(["report", str(run), "--out", str(out), "--overwrite"]) == 0
+        mudg.report([run], out=tmp_path / "all.pdf")
+    assert app.main(["report", str(run), "--out", str(out), "--overwrite"]) == 0
     assert "page: " in capsys.readouterr().out
 
 

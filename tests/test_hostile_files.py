@@ -19,7 +19,7 @@ import write_custom
 import yaml
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.plain_yaml import DEEPEST, parse_yaml
@@ -82,7 +82,7 @@ def test_the_command_line_waits_for_no_pipe(words: list[str], tmp_path: Path, ca
     os.mkfifo(tmp_path / "PIPE")
     (tmp_path / "FIT").mkdir()
     with ends_within(20):
-        code = cli.main([str(tmp_path / word) if word.isupper() else word for word in words])
+        code = app.main([str(tmp_path / word) if word.isupper() else word for word in words])
     assert code in (2, 3), capsys.readouterr().err
     assert "Traceback" not in capsys.readouterr().err
 
@@ -179,7 +179,7 @@ def test_hostile_yaml_is_refused_at_once(name: str, tmp_path: Path, capsys: pyte
         with pytest.raises(InputError, match=f"(?s){words}"):
             parse_edits(content, "edits.yaml", tmp_path)
         (tmp_path / "c.yaml").write_bytes(content)
-        assert cli.main(["fuse", "scene", "--out", str(tmp_path / "out"), "--config", str(tmp_path / "c.yaml")]) == 3
+        assert app.main(["fuse", "scene", "--out", str(tmp_path / "out"), "--config", str(tmp_path / "c.yaml")]) == 3
         list_text = content.replace(b"a: ", b"scenes: ", 1)
         (tmp_path / "l.yaml").write_bytes(list_text)
         with pytest.raises(InputError):

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mudg import cli
+from mudg import app
 from mudg.base.errors import InputError
 from mudg.data.city.config import CityConfig
 from mudg.data.scene import read_scene
@@ -28,9 +28,9 @@ def test_a_current_folder_that_is_gone_is_said(
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    assert cli.main(words.split()) == 5
+    assert app.main(words.split()) == 5
     assert "the current folder is gone" in capsys.readouterr().err
-    assert cli.main(["--help"]) == 0
+    assert app.main(["--help"]) == 0
 
 
 LIMITED = """

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.records import StrictRecord, parse_record
@@ -98,7 +98,7 @@ def test_no_verb_prints_what_a_track_is_called_as_it_is(tmp_path: Path, capsys: 
     (scene / "manifest.json").unlink(missing_ok=True)
     named_so = str(tmp_path / FORGED[:9])
     for words in (["doctor", str(scene)], ["fuse", str(scene), "--out", named_so], ["doctor", named_so]):
-        cli.main(words)
+        app.main(words)
         said = capsys.readouterr()
         assert "forged" in said.out + said.err or words[1] != str(scene)
         assert not OBEYED.search(said.out + said.err), ascii(said.out + said.err)

@@ -19,7 +19,7 @@ import roundtrip
 from memory_limits import at_most
 from roundtrip import needs_native
 
-from mudg import cli
+from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
@@ -345,7 +345,7 @@ def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "a.ncore4.zarr.itar").write_bytes(b"")
     with pytest.raises(ResourceError, match=r"mudg\[ncore\]"):
         ingest(tmp_path, tmp_path / "out")
-    assert cli.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0
+    assert app.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0
     assert not (tmp_path / "out").exists()
 
 
@@ -396,10 +396,10 @@ def test_one_of_several_recordings(recording: Path, tmp_path: Path) -> None:
 @needs_package
 def test_the_commands(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     export = ["export", "ncore", truth.root, "--out", str(tmp_path / "out")]
-    assert cli.main(export) == 0
-    assert cli.main(export) == 0
+    assert app.main(export) == 0
+    assert app.main(export) == 0
     assert "reused" in capsys.readouterr().err
-    assert cli.main(["ingest", str(tmp_path / "out"), str(tmp_path / "back"), "--no-contact-sheet"]) == 0
+    assert app.main(["ingest", str(tmp_path / "out"), str(tmp_path / "back"), "--no-contact-sheet"]) == 0
 
 
 # --- damage -----------------------------------------------------------------------------------------------------------

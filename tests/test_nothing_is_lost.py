@@ -19,7 +19,7 @@ from toy_clips import tiny, write_clips
 from toy_published import TINY, tiny_checkpoint
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.bench import run as bench
@@ -210,7 +210,7 @@ def test_an_output_that_touches_an_input_is_refused(name: str, world: dict[str, 
 def test_the_command_line_ends_with_code_2(world: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = copied(world, ("scene",), tmp_path)["scene"]
     before = tree(tmp_path)
-    assert cli.main(["fuse", str(scene), "--out", str(scene), "--overwrite"]) == 2
+    assert app.main(["fuse", str(scene), "--out", str(scene), "--overwrite"]) == 2
     said = capsys.readouterr().err
     assert "is also an input" in said and "what to do" in said and "Traceback" not in said
     assert tree(tmp_path) == before

@@ -143,8 +143,8 @@ def stopped_command(
     given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
     script = (
         "import signal, sys, time; sys.path[:0] = sys.argv[2:]\nfrom pathlib import Path\n"
-        "import test_processes as t\nfrom mudg import cli\n"
-        "from mudg.base.processes import calls_beside, run_in_processes\nfrom dataclasses import replace\n"
+        "import test_processes as t\nfrom mudg import app\nfrom mudg.steps.doctor import Doctor\n"
+        "from mudg.base.processes import calls_beside, run_in_processes\n"
         "def work(_args):\n"
         "    folders = sorted(Path(sys.argv[1]).glob('[0-9]*'))\n"
         "    calls = [(f.name[1:], f) for f in folders]\n"
@@ -152,8 +152,8 @@ def stopped_command(
         "    return {}\n"
         "if __name__ == '__main__':\n"
         "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in what a script starts in the background
-        "    cli.VERBS['doctor'] = replace(cli.VERBS['doctor'], call=work)\n"
-        "    sys.exit(cli.main(['doctor']))\n"
+        "    Doctor.run = work\n"
+        "    sys.exit(app.main(['doctor']))\n"
     )
     (tmp_path / "parent.py").write_text(script)
     places = [str(Path(__file__).parent), *(path for path in sys.path if path)]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import mudg
-from mudg import verbs
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 
@@ -73,27 +72,27 @@ def test_objects_can_be_removed_and_moved(notebook: dict[str, Any]) -> None:
 def test_verbs_check_settings_as_the_command_does(notebook: dict[str, Any], tmp_path: Path) -> None:
     folder = notebook["folder"]
     with pytest.raises(UsageError, match="unknown configuration key voxel"):
-        verbs.fuse(folder / "scene", tmp_path / "x", voxel=0.1)
+        mudg.fuse(folder / "scene", out=tmp_path / "x", voxel=0.1)
     with pytest.raises(UsageError, match="not valid"):
-        verbs.fuse(folder / "scene", tmp_path / "x", voxel_m=-1)
+        mudg.fuse(folder / "scene", out=tmp_path / "x", voxel_m=-1)
     with pytest.raises(UsageError, match="unknown configuration key loss"):
-        verbs.fit(folder / "scene", folder / "fused", tmp_path / "x", loss={"nonsense": 1})
+        mudg.fit(folder / "scene", folder / "fused", out=tmp_path / "x", loss={"nonsense": 1})
     assert not (tmp_path / "x").exists()
-    assert verbs.fuse(folder / "scene", folder / "fused") == folder / "fused"  # verified and reused
-    assert verbs.doctor()["problems"] is not None
+    assert mudg.fuse(folder / "scene", out=folder / "fused") == folder / "fused"  # verified and reused
+    assert mudg.doctor()["problems"] is not None
     assert mudg.read_scene(folder / "scene").frames
 
 
 def test_what_a_notebook_gets_wrong_is_refused_in_words(notebook: dict[str, Any], tmp_path: Path) -> None:
     scene, view = notebook["folder"] / "scene", notebook["view"]
     for said, wrong in (
-        ("views are names with their folders", lambda: verbs.score(scene, ["views"], tmp_path / "a")),  # type: ignore[arg-type]
-        ("shifts_m", lambda: verbs.run("city", tmp_path / "a", shifts_m=2.0)),
-        ("cameras", lambda: verbs.run("city", tmp_path / "a", cameras="front")),
-        ("seed", lambda: verbs.run("city", tmp_path / "a", seed="x")),  # type: ignore[arg-type]
+        ("--views", lambda: mudg.score(scene, ["views"], out=tmp_path / "a")),  # type: ignore[arg-type]
+        ("--shifts-m", lambda: mudg.run("city", out=tmp_path / "a", shifts_m=2.0)),
+        ("--cameras", lambda: mudg.run("city", out=tmp_path / "a", cameras="front")),
+        ("--seed", lambda: mudg.run("city", out=tmp_path / "a", seed="x")),  # type: ignore[arg-type]
         (
             r"loss: \{ssim_weight: \.\.\.\}",
-            lambda: verbs.fit(scene, scene, tmp_path / "a", **{"loss.ssim_weight": 0.1}),
+            lambda: mudg.fit(scene, scene, out=tmp_path / "a", **{"loss.ssim_weight": 0.1}),
         ),
         (r"not a mudg\.Camera", lambda: notebook["fitted"].render("front", view.world_from_cam, view.time_s)),
     ):
@@ -105,4 +104,4 @@ def test_what_a_notebook_gets_wrong_is_refused_in_words(notebook: dict[str, Any]
 def test_settings_take_path_objects(notebook: dict[str, Any], tmp_path: Path) -> None:
     folder = notebook["folder"]
     with pytest.raises(InputError, match="no diffusion model here"):
-        verbs.synthesize(folder / "scene", folder / "fused", tmp_path / "a", model=tmp_path / "none")
+        mudg.synthesize(folder / "scene", folder / "fused", out=tmp_path / "a", model=tmp_path / "none")

@@ -20,7 +20,7 @@ import torch
 import toy_views
 from jinja2 import UndefinedError
 
-from mudg import cli
+from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
@@ -129,7 +129,7 @@ def test_the_report_holds_commands_that_can_be_copied_and_work(
     assert {"view", "page", "edit", "render", "export", "asset", "run", "score"} <= set(verbs)
     for line in lines:  # the score of this run is real, with its run.yaml
         if line.startswith("mudg "):
-            args = cli.parse(shlex.split(line)[1:])
+            args, _ = app.parse(shlex.split(line)[1:])
             for given in (getattr(args, name, None) for name in ("run", "scene")):
                 assert given is None or Path(given).exists(), line
     assert subprocess.run(next(x for x in lines if x.startswith("printf")), shell=True, check=True).returncode == 0
@@ -137,7 +137,7 @@ def test_the_report_holds_commands_that_can_be_copied_and_work(
     assert script is not None and [(e.verb, list(e.settings.ids)) for e in script.edits] == [("remove", ["car 1"])]
     before = store.digest(out / "score")
     capsys.readouterr()
-    assert cli.main(shlex.split(next(x for x in lines if x.startswith("mudg score")))[1:]) == 0
+    assert app.main(shlex.split(next(x for x in lines if x.startswith("mudg score")))[1:]) == 0
     assert "reused" in capsys.readouterr().err and store.digest(out / "score") == before
     assert len(blocks) == text.count('class="commands"') and "navigator.clipboard" in text
 

@@ -20,7 +20,7 @@ from faults import failing, in_child, killed, points
 from test_gallery import run_of
 from toy_fitted import write_toy_run
 
-from mudg import FittedScene, cli
+from mudg import FittedScene, app
 from mudg.base import store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, take_lock
@@ -43,7 +43,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_toy_run(root, degree=0)
     run_of(root / "run")
     run_of(root / "other_run")
-    assert cli.main(["export", "ply", str(root / "fit"), "--out", str(root / "van.ply"), "--quiet"]) == 0
+    assert app.main(["export", "ply", str(root / "fit"), "--out", str(root / "van.ply"), "--quiet"]) == 0
     return root
 
 
@@ -61,7 +61,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 def command(name: str, toy: Path, folder: Path, more: str = "") -> Callable[[], int]:
     out, words, _ = COMMANDS[name]
     line = f"{words} {more}".replace("TOY", str(toy)).replace("OUT", str(folder / out)).split()
-    return lambda: cli.main(line)
+    return lambda: app.main(line)
 
 
 def pair(out: Path) -> dict[str, bytes]:
@@ -230,7 +230,7 @@ def test_any_number_of_threads_writes_the_same_bytes(name: str, crowd: Path, tmp
             (tmp_path / str(threads)).mkdir()
             line = COMMANDS[name][1].replace("TOY/fit", str(crowd / "crowd")).replace("TOY", str(crowd))
             out = tmp_path / str(threads) / COMMANDS[name][0]
-            assert cli.main(line.replace("OUT", str(out)).split()) == 0
+            assert app.main(line.replace("OUT", str(out)).split()) == 0
             made.add(out.read_bytes())
             assert torch.get_num_threads() == threads
     finally:

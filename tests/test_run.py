@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from mudg import cli
+from mudg import app
 from mudg.base import config as configuration
 from mudg.base import (
     log,
@@ -283,7 +283,7 @@ def test_ctrl_c_prints_how_to_continue(
 ) -> None:
     verbs["trouble"]["fuse"] = KeyboardInterrupt()
     words = ["demo", "--fast", "--out", str(tmp_path / "my out")]
-    assert cli.main(words) == 130
+    assert app.main(words) == 130
     assert f"mudg demo --fast --out '{tmp_path / 'my out'}'" in capsys.readouterr().err
 
 

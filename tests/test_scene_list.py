@@ -10,7 +10,7 @@ import pytest
 import torch
 from toy_clips import tiny, write_clips
 
-from mudg import cli
+from mudg import app
 from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
@@ -177,8 +177,8 @@ def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
 def test_the_command_takes_an_address_of_clips(address, tmp_path, capsys):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(configuration.dump_yaml(tiny(address.text, steps=2)))
-    assert cli.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0, capsys.readouterr().err
-    assert cli.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
+    assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0, capsys.readouterr().err
+    assert app.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
     assert "a path of this machine" in capsys.readouterr().err
 
 

@@ -19,7 +19,7 @@ import pytest
 import toy_splats
 from foreign_splats import C1, F_REST, ROWS, rows
 
-from mudg import cli
+from mudg import app
 from mudg.base.errors import InputError
 from mudg.data.splats import formats
 from mudg.data.splats.cloud import SplatCloud
@@ -69,7 +69,7 @@ def read(content: bytes, name: str = "a.ply", axes: str = "file") -> SplatCloud:
 def command(tmp_path: Path, content: bytes, suffix: str, *flags: str) -> int:
     (tmp_path / f"in{suffix}").write_bytes(content)
     out = str(tmp_path / "out")
-    return cli.main(["asset", "import", str(tmp_path / f"in{suffix}"), "--kind", "scene", "--out", out, "--overwrite", "--quiet", *flags])
+    return app.main(["asset", "import", str(tmp_path / f"in{suffix}"), "--kind", "scene", "--out", out, "--overwrite", "--quiet", *flags])
 
 
 # -- drawing -------------------------------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ def test_parts_of_a_bundle_state_their_axes() -> None:
 
 def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.ply").write_bytes(MARKED["ply Brush"][0])
-    assert cli.main(["asset", "import", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.safetensors")]) == 0
+    assert app.main(["asset", "import", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.safetensors")]) == 0
     assert "antialiased" in capsys.readouterr().err
 
 
@@ -607,7 +607,7 @@ def test_bounds_of_chunks_in_double_keep_their_places() -> None:
 
 def test_a_far_object_keeps_its_shape(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(far_ply(UTM))
-    assert cli.main(["asset", "import", str(tmp_path / "a.ply"), "--axes", "world", "--out", str(tmp_path / "a.safetensors")]) == 0
+    assert app.main(["asset", "import", str(tmp_path / "a.ply"), "--axes", "world", "--out", str(tmp_path / "a.safetensors")]) == 0
     means = read_asset(tmp_path / "a.safetensors").columns["means"].numpy()
     assert np.abs((means - means[0]) - NEAR).max() < 1e-6
 

@@ -9,9 +9,13 @@ from typing import Any
 
 import pytest
 
-from mudg import cli
+from mudg import app
 from mudg.base import staging, store
+from mudg.base.errors import ResourceError
 from mudg.base.location import Location
+from mudg.stages.config import ScoreConfig
+from mudg.steps.report import Report
+from mudg.steps.score import Score
 
 fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
 
@@ -31,7 +35,7 @@ CITY = (
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("scenes") / "city"
-    assert cli.main(["ingest", "city", str(out), *CITY, "--quiet"]) == 0
+    assert app.main(["ingest", "city", str(out), *CITY, "--quiet"]) == 0
     return out
 
 
@@ -52,7 +56,7 @@ def scratch(tmp_path: Path) -> Path:
 @pytest.fixture
 def command(scratch: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     def run(*words: str) -> tuple[int, str, str]:
-        code = cli.main([*words, "--scratch", str(scratch), "--quiet"])
+        code = app.main([*words, "--scratch", str(scratch), "--quiet"])
         said = capfd.readouterr()
         return code, said.out, said.err
 
@@ -69,7 +73,7 @@ def test_two_steps_from_store_to_store(command: Callable[..., Any], scratch: Pat
     assert code == 0 and json.loads(said) == {"fused": "memory://bucket/runs/fused"}
     assert not any(scratch.iterdir()), "nothing is left behind"
     at("memory://bucket/runs/fused").fetch(tmp_path / "fused")
-    assert cli.main(["fuse", str(scene), "--out", str(tmp_path / "here"), "--quiet"]) == 0
+    assert app.main(["fuse", str(scene), "--out", str(tmp_path / "here"), "--quiet"]) == 0
     assert store.digest(tmp_path / "fused") == store.digest(tmp_path / "here")
     record = (tmp_path / "fused/run.json").read_text()
     assert json.loads(record)["key"] == json.loads((tmp_path / "here/run.json").read_text())["key"]
@@ -131,9 +135,7 @@ def test_a_file_goes_to_an_address_too(command: Callable[..., Any], scene: Path)
         (args.out.parent / "page_more/x.bin").write_bytes(b"x")
         return {"page": args.out, "text": f"see {args.out}"}
 
-    from mudg import flags
-
-    args = flags.ReportFlags(runs=(scene,), out=Path("memory://bucket/pages/page.html"))
+    args = Report(runs=(scene,), out=Path("memory://bucket/pages/page.html"))
     said = staging.run_staged("report", args, write)
     assert said == {"page": "memory://bucket/pages/page.html", "text": "see memory://bucket/pages/page.html"}
     assert (
@@ -150,21 +152,16 @@ def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
     def look(args: Any) -> dict[str, Any]:
         seen.update(
             scene=args.scene.read_bytes(),
-            views=[Path(one.partition("=")[2]).read_bytes() for one in args.views],
+            views=[path.read_bytes() for path in args.views.values()],
             out=args.out,
         )
         return {}
 
-    from mudg import flags
-    from mudg.stages.config import ScoreConfig
-
-    views = ("mine=memory://bucket/a/views", f"theirs={scratch / 'x'}")
+    views = {"mine": Path("memory://bucket/a/views"), "theirs": scratch / "x"}
     scratch.mkdir()
     (scratch / "x").write_bytes(b"local")
-    args = flags.Score(
-        scene=Path("memory://bucket/scene"), views=views, out=scratch / "out", scratch=scratch, settings=ScoreConfig()
-    )
-    staging.run_staged("score", args, look)
+    args = Score(scene=Path("memory://bucket/scene"), views=views, out=scratch / "out", settings=ScoreConfig())
+    staging.run_staged("score", args, look, scratch)
     assert seen == {"scene": b"scene", "views": [b"views", b"local"], "out": scratch / "out"}
 
 
@@ -195,27 +192,20 @@ def test_what_cannot_be_is_refused(words: tuple[str, ...], said: str, command: C
 
 def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) -> None:
     """Not at the same time, and not that of another user."""
-    from mudg import flags
-    from mudg.base.errors import ResourceError
-
-    args = flags.ReportFlags(runs=(scene,), out=Path("memory://bucket/page.html"), scratch=scratch)
+    args = Report(runs=(scene,), out=Path("memory://bucket/page.html"))
 
     def write(inner: Any) -> dict[str, Any]:
         (folder,) = scratch.iterdir()
         store.write_json(folder / "lock", {"pid": 1, "host": __import__("socket").gethostname()})
         with pytest.raises(ResourceError, match="another process"):
-            staging.run_staged("report", args, write)
+            staging.run_staged("report", args, write, scratch)
         inner.out.write_text("page")
         return {}
 
-    staging.run_staged("report", args, write)
+    staging.run_staged("report", args, write, scratch)
     (scratch / "elsewhere").mkdir()
-    name = staging._Staging.of("report", args).folder
+    name = staging._Staging.of("report", args, scratch).folder
     name.symlink_to(scratch / "elsewhere")
     with pytest.raises(ResourceError, match="somebody else"):
-        staging.run_staged("report", args, write)
+        staging.run_staged("report", args, write, scratch)
 
-
-def test_a_command_without_addresses_is_not_touched() -> None:
-    args = object()
-    assert cli._with_named_output(args) is args

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import pytest
 
-from mudg import cli
+from mudg import app
 from mudg.base import remote, store
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.location import Location
@@ -202,12 +202,12 @@ def test_commands_from_store_to_store(root: Location, tmp_path: Path, capfd: pyt
         "--no-contact-sheet",
     )
     scratch = ("--scratch", str(tmp_path / "scratch"), "--quiet")
-    assert cli.main(["ingest", "city", str(root / "city"), *city, *scratch]) == 0
+    assert app.main(["ingest", "city", str(root / "city"), *city, *scratch]) == 0
     fuse = ["fuse", str(root / "city"), "--out", str(root / "fused"), *scratch]
-    assert cli.main([*fuse, "--json"]) == 0
+    assert app.main([*fuse, "--json"]) == 0
     assert json.loads(capfd.readouterr().out.partition("\n")[2]) == {"fused": str(root / "fused")}
-    assert cli.main(["ingest", "city", str(tmp_path / "city"), *city, "--quiet"]) == 0
-    assert cli.main(["fuse", str(tmp_path / "city"), "--out", str(tmp_path / "fused"), "--quiet"]) == 0
+    assert app.main(["ingest", "city", str(tmp_path / "city"), *city, "--quiet"]) == 0
+    assert app.main(["fuse", str(tmp_path / "city"), "--out", str(tmp_path / "fused"), "--quiet"]) == 0
     (root / "fused").fetch(tmp_path / "back")
     assert store.digest(tmp_path / "back") == store.digest(tmp_path / "fused")
     assert not any((tmp_path / "scratch").iterdir())
@@ -333,15 +333,15 @@ def test_a_batch_whose_list_logs_claims_and_results_lie_in_a_store(
         print(f"{server}: taken over {taken[0]['at'] - killed:.1f} s after the kill, lease {lease_s:.0f} s")
     assert 0 < taken[0]["at"] - killed < lease_s + 5
     capfd.readouterr()
-    assert cli.main(["batch", "status", str(made.out), "--html", "--json"]) == 0
+    assert app.main(["batch", "status", str(made.out), "--html", "--json"]) == 0
     found = json.loads(capfd.readouterr().out)
     assert (found["finished"], found["left"], found["stages"]["command"]["failed"]) == (5, 0, 1)
     assert (
         found["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
     )
-    assert cli.main(["batch", "cost", str(made.out), "--price", "1"]) == 0
+    assert app.main(["batch", "cost", str(made.out), "--price", "1"]) == 0
     made.put_log("s03", "text of s03\n")
-    assert cli.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0
+    assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0
     assert made.start("three", *lease).wait(120) == 0
     assert made.results() == {name: f"text of {name}\n" for name in made.names}
     once = {name for name, count in made.runs().items() if count == 1}
@@ -468,7 +468,7 @@ def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) ->
         for seed in ("1", "2"):
             scene = str(place / f"scenes/c{seed}")
             assert (
-                cli.main(
+                app.main(
                     [
                         "ingest",
                         "city",
@@ -497,7 +497,7 @@ def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) ->
             "1",
         ]
         assert (
-            cli.main(
+            app.main(
                 [*words, "--bounds", "fuse.json:points_static>=1", "--quiet", "--scratch", str(tmp_path / machine)]
             )
             == 0

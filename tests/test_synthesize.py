@@ -8,7 +8,7 @@ import torch
 from fit_settings import fit_config
 from toy_scene import ToyStreet
 
-from mudg import cli
+from mudg import app
 from mudg.base import palette, scratch
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
@@ -242,14 +242,14 @@ def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, cap
         (tmp_path / folder).mkdir()
         (tmp_path / folder / name).write_text("{}")
     words = ["synthesize", str(tmp_path / "scene"), "--fused", str(tmp_path / "fused"), "--out", str(tmp_path / "out")]
-    assert cli.main([*words, "--sampler", "dpm_solver", "--eta", "0.5"]) == 2
+    assert app.main([*words, "--sampler", "dpm_solver", "--eta", "0.5"]) == 2
     said = capsys.readouterr().err
     assert all(word in said for word in ("dpm_solver", "eta", "ddim"))
     assert not (tmp_path / "out").exists()
     for flags, word in ((("--guidance", "3"), "guidance"), (("--memory-budget-gb", "3"), "memory-budget")):
-        assert cli.main([*words, *flags]) == 2
+        assert app.main([*words, *flags]) == 2
         assert word in capsys.readouterr().err
-    assert cli.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
+    assert app.main([*words, "--sampler", "ddim", "--eta", "0.5"]) == 3  # on to the next fault: no such scene
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ WRITES = """
 import resource, sys
 import numpy as np
 from pathlib import Path
-from mudg import cli
+from mudg import app
 from mudg.base import failures
 from mudg.base.errors import ResourceError
 from mudg.data.exporters.video import write_mp4

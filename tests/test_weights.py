@@ -14,7 +14,7 @@ import pytest
 import torch
 from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_checkpoint
 
-from mudg import cli
+from mudg import app
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.data import weights
 from mudg.models.published import files as published_files
@@ -325,7 +325,7 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
         ([str(tmp_path / "512.ckpt"), "--to", str(tmp_path / "there"), "--overwrite"], 2, "do not belong to a model"),
     )
     for words, code, message in cases:
-        assert cli.main(["convert", *words]) == code
+        assert app.main(["convert", *words]) == code
         assert message in capsys.readouterr().err
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from shared import device_of, finish, flags, work_folder
 
-from mudg import verbs
+import mudg
 from mudg.base import store
 
 TINY: dict[str, dict[str, Any]] = {
@@ -34,7 +34,7 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     if options.small:
         settings["shifts_m"] = (2.0,)
     out = work_folder(options) / "run"
-    made = verbs.run("city", out, preset=options.preset, **settings)
+    made = mudg.run("city", out=out, preset=options.preset, **settings)
     rows = [{"what": name, "seconds": seconds, "minutes": seconds / 60} for name, seconds in made["seconds"].items()]
     return finish(options, device, rows, {"metrics": store.digest(made["metrics"])})
 

@@ -1,5 +1,15 @@
 """mudg: from a driving log to lane-shifted RGB, depth and semantic video and a dynamic 3D Gaussian scene.
 
+Every verb of the command is a function: inputs as arguments, the output folder as ``out``, settings by name.
+
+    mudg.fuse("scenes/a", out="runs/fused", voxel_m=0.08)
+    mudg.fit("scenes/a", "runs/fused", out="runs/fit", method="street_gaussians", loss={"lidar_weight": 0.2})
+
+``help(mudg.fit)`` shows all settings of a verb. A group of settings is a dictionary; ``config`` names a YAML file that is read before the
+settings, as ``--config`` does. What the command refuses is refused here, with the errors of ``mudg.base.errors``. A finished result of the
+same settings and inputs is verified and reused; an interrupted one is resumed. Where a scene, clouds, a fit or views are read, the folder
+of a finished ``run`` will do.
+
 The names below are what the package promises to keep. They are looked up on first use, so that ``import mudg`` is
 fast and loads no torch.
 """
@@ -15,7 +25,6 @@ if TYPE_CHECKING:
     from mudg.data.observations import read_observations
     from mudg.data.scene import read_scene
     from mudg.fitted import FittedScene, Picture
-    from mudg.stages.run import run_chain
 
 __version__ = "0.1.0"
 
@@ -35,8 +44,14 @@ _HOMES = {
     "rasterize": "mudg.core.raster.rasterize",
     "read_observations": "mudg.data.observations",
     "read_scene": "mudg.data.scene",
-    "run_chain": "mudg.stages.run",
 }
+
+_VERBS = {
+    "adapt": "adapt", "annotate": "annotate", "bench": "bench", "convert": "convert", "demo": "demo", "doctor": "doctor", "edit": "edit",
+    "export": "export", "export_asset": "asset export", "fit": "fit", "fuse": "fuse", "import_asset": "asset import", "ingest": "ingest",
+    "learn": "learn", "page": "page", "render": "render", "report": "report", "run": "run", "score": "score", "synthesize": "synthesize",
+}  # fmt: skip
+"""Functions, and the verbs that they are."""
 
 __all__ = [
     "Camera",
@@ -52,10 +67,29 @@ __all__ = [
     "Trajectory",
     "View",
     "__version__",
+    "adapt",
+    "annotate",
+    "bench",
+    "convert",
+    "demo",
+    "doctor",
+    "edit",
+    "export",
+    "export_asset",
+    "fit",
+    "fuse",
+    "import_asset",
+    "ingest",
+    "learn",
+    "page",
     "rasterize",
     "read_observations",
     "read_scene",
-    "run_chain",
+    "render",
+    "report",
+    "run",
+    "score",
+    "synthesize",
 ]
 
 
@@ -67,6 +101,12 @@ def __getattr__(name: str) -> object:
         value = getattr(importlib.import_module(_HOMES[name]), name)
         globals()[name] = value
         return value
+    if name in _VERBS:
+        from mudg import steps
+        from mudg.steps.step import python_function
+
+        globals()[name] = python_function(steps.step_class(_VERBS[name]), name)
+        return globals()[name]
     raise AttributeError(f"module 'mudg' has no attribute {name!r}")
 
 

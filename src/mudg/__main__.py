@@ -2,7 +2,7 @@
 
 import sys
 
-from mudg.cli import main
+from mudg.app import main
 
 if __name__ == "__main__":
     sys.exit(main())

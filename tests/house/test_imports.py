@@ -35,7 +35,7 @@ def test_the_words_of_the_package_need_no_torch() -> None:
     "arguments", [["--help"], ["--version"], ["demo", "--help"], ["fit", "--help"], ["fit"], ["nonsense"]]
 )
 def test_the_command_line_answers_without_torch(arguments: list[str]) -> None:
-    code = f"import contextlib\nfrom mudg import cli\nwith contextlib.suppress(SystemExit): cli.main({arguments!r})"
+    code = f"import contextlib\nfrom mudg import app\nwith contextlib.suppress(SystemExit): app.main({arguments!r})"
     found = loaded_by(code)
     assert "torch" not in found
     assert "scipy" not in found

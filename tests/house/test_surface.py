@@ -5,19 +5,23 @@
 
 from __future__ import annotations
 
-import dataclasses
+import inspect
 import json
 import os
 import re
 from pathlib import Path
-from typing import get_type_hints
 
 import pytest
 
 import mudg
-from mudg import cli, flags
+from mudg import app, steps
+from mudg.steps import command
+from mudg.steps.step import flag_name, flag_of, options, signature
 
 HERE = Path(__file__).parent
+MAX_HELP_LINES = 45
+SETTINGS_BUDGET = 430
+"""Distinct settings over all verbs; lower it when settings go."""
 
 
 def frozen(name: str, now: object) -> object:
@@ -28,13 +32,6 @@ def frozen(name: str, now: object) -> object:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def help_text(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stopped:
-        flags.parse(verb, ["--help-all" if verb in flags.CHAINS else "--help"], "summary")
-    assert stopped.value.code == 0
-    return capsys.readouterr().out
-
-
 def test_public_names_are_frozen() -> None:
     now = sorted(mudg.__all__)
     assert now == frozen("api.json", now)
@@ -43,61 +40,73 @@ def test_public_names_are_frozen() -> None:
     assert set(now) <= set(dir(mudg))
 
 
-def test_flags_are_frozen(capsys: pytest.CaptureFixture[str]) -> None:
-    now = {verb: sorted(set(re.findall(r"--[a-z][\w.-]*", help_text(verb, capsys)))) for verb in cli.VERBS}
+def test_flags_are_frozen() -> None:
+    common = [flag_name(option.name) for option in command.common_options()]
+    now = {
+        verb: sorted(
+            {flag_name(one.name) for one in options(steps.step_class(verb)) if not is_word(verb, one.name)} | {*common}
+        )
+        for verb in steps.VERBS
+    }
     assert now == frozen("cli.json", now)
 
 
-def test_every_verb_has_flags_and_every_flag_an_explanation(capsys: pytest.CaptureFixture[str]) -> None:
-    assert set(cli.VERBS) == set(flags.FLAGS)
-    listed = [name for _, names in cli.SECTIONS for name in names]
-    assert sorted(listed) == sorted(cli.VERBS)
-    for verb in cli.VERBS:
-        text = help_text(verb, capsys)
-        assert "(default:" in text
-        assert "usage: mudg " + verb in text
+def is_word(verb: str, name: str) -> bool:
+    """Whether a field is given without a flag."""
+    cls = steps.step_class(verb)
+    return name in inspect.get_annotations(cls) and flag_of(cls, name).position in ("first", "rest")
 
 
-def test_every_field_has_a_text(capsys: pytest.CaptureFixture[str]) -> None:
-    bare = []
-    for verb, kind in flags.FLAGS.items():
-        help_text(verb, capsys)
-        todo = [(verb, kind)]
-        while todo:
-            name, of = todo.pop()
-            inside = {n: t for n, t in get_type_hints(of).items() if dataclasses.is_dataclass(t)}
-            todo += [(f"{name}.{n}", t) for n, t in inside.items()]
-            bare += [f"{name}.{f.name}" for f in dataclasses.fields(of) if not f.metadata.get("help")]
+@pytest.mark.parametrize("verb", steps.VERBS)
+def test_every_flag_has_an_explanation_and_help_is_short(verb: str) -> None:
+    cls = steps.step_class(verb)
+    bare = [one.name for one in options(cls) if not one.text]
     assert not bare
+    page, whole = command.help_page(cls, everything=False), command.help_page(cls, everything=True)
+    assert f"usage: mudg {verb}" in page and len(page.splitlines()) <= MAX_HELP_LINES
+    for one in options(cls):
+        if not is_word(verb, one.name):
+            last = one.name.rpartition(".")[2].replace("_", "-")
+            assert re.search(rf"^  --\S*(\[no-\])?{re.escape(last)}(?![\w-])", whole, re.MULTILINE), one.name
+    unknown = set(cls.short) - {one.name for one in options(cls)}
+    assert not unknown
+    assert not cls.short or "--help-all" in page
 
 
-def test_help_reads_no_source_class_by_class(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What tyro does for a field without a text: it parses the module anew for every class, which took longer than all else."""
-
-    def refuse(*_: object) -> None:
-        raise AssertionError("the source of a class was asked for")
-
-    monkeypatch.setattr("inspect.getsource", refuse)
-    assert "Optimisation steps" in help_text("fit", capsys)
-    assert "Hold out every n-th frame" in help_text("run", capsys)
+@pytest.mark.parametrize("verb", steps.VERBS)
+def test_no_setting_has_the_name_of_an_input(verb: str) -> None:
+    names = [one.name for one in options(steps.step_class(verb))]
+    assert len(names) == len(set(names))
 
 
-def test_the_help_of_a_chain_is_short_and_says_where_the_rest_is(capsys: pytest.CaptureFixture[str]) -> None:
-    for verb in flags.CHAINS:
-        with pytest.raises(SystemExit) as stopped:
-            flags.parse(verb, ["--help"], "summary")
-        assert stopped.value.code == 0
-        text = capsys.readouterr().out
-        assert "--fit.method" not in text
-        assert f"mudg {verb} --help-all" in text.replace("\n", " ")
-        assert ("--protocols" if verb == "bench" else "--shifts-m") in text
+def test_settings_stay_within_their_budget() -> None:
+    """A setting counts once, whichever verbs take it."""
+    own = {
+        (verb, one.name)
+        for verb in steps.VERBS
+        if verb not in ("run", "demo", "bench")
+        for one in options(steps.step_class(verb))
+        if not one.own
+    }
+    own |= {("run", one.name) for one in options(steps.step_class("run")) if not one.own and "." not in one.name}
+    own |= {("bench", one.name) for one in options(steps.step_class("bench")) if not one.own and "." not in one.name}
+    assert len(own) <= SETTINGS_BUDGET, len(own)
 
 
-def test_help_lists_only_what_exists() -> None:
-    overview = cli.overview()
-    for name in cli.VERBS:
-        assert f"\n  {name}" in overview
-    for later in ("cluster",):
-        assert f"\n  {later}" not in overview
+def test_a_function_shows_its_settings_and_defaults() -> None:
+    fit = inspect.signature(mudg.fit)
+    assert list(fit.parameters)[:2] == ["scene", "fused"]
+    assert (
+        fit.parameters["out"].kind is inspect.Parameter.KEYWORD_ONLY
+        and fit.parameters["out"].default is inspect.Parameter.empty
+    )
+    assert fit.parameters["iterations"].default == 2000 and "Optimisation steps" in (mudg.fit.__doc__ or "")
+    for verb in steps.VERBS:
+        assert signature(steps.step_class(verb)).parameters
+
+
+def test_the_overview_lists_every_verb() -> None:
+    overview = app.overview()
+    for verb in steps.VERBS:
+        assert f"\n  {verb} " in overview
+    assert [verb for _, verbs in steps.sections() for verb in verbs if verbs] != []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -73,7 +73,26 @@ def load(
     if overrides:
         _refuse_moved(overrides, "flags", config_type)
         values = _merge(values, dict(overrides), "flags", config_type)
-    return build(config_type, values, str(yaml_path or "configuration"))
+    try:
+        return TypeAdapter(config_type).validate_python(values)
+    except ValidationError as error:
+        path = [str(part) for part in error.errors(include_url=False)[0]["loc"]]
+        problem = first_problem(error, f"{yaml_path or 'configuration'}: ", UsageError)
+        if _holds(overrides or {}, path):
+            flag = "--" + ".".join(path).replace("_", "-")
+            problem = UsageError(problem.what, where=flag, expected=problem.expected, got=problem.got, remedy=problem.remedy)
+        raise problem from error
+
+
+def _holds(values: Any, path: Sequence[str]) -> bool:
+    """Whether nested values have something at a path, or the value in which it lies."""
+    for part in path:
+        if not isinstance(values, Mapping):
+            return True
+        if part not in values:
+            return False
+        values = values[part]
+    return True
 
 
 def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:

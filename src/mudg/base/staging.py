@@ -40,11 +40,12 @@ def refuse_secrets(words: Sequence[str]) -> None:
                 raise UsageError("an address holds a user or a password", where=f"{scheme_of(found)}://...", remedy="leave them out")
 
 
-def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]], scratch: Path | None = None) -> dict[str, Any]:
     """Call a verb with its flags; those that are addresses are staged.
 
     Args:
-        verb: its name. args: its flags, a dataclass. call: flags of this machine's paths -> what the verb says.
+        verb: its name. args: its flags, a dataclass. call: flags of this machine's paths -> what the verb says. scratch: folder for what
+            is fetched and made (None: the system's for temporary files).
 
     Returns:
         What the verb says, with addresses for the paths.
@@ -52,7 +53,7 @@ def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]]) -> d
     Raises:
         UsageError: an address where none can be, or an output that touches an input. Whatever transfers and the verb raise.
     """
-    plan = _Staging.of(verb, args)
+    plan = _Staging.of(verb, args, scratch)
     if not plan.inputs and not plan.outputs:
         return call(args)
     with plan.locked():
@@ -80,14 +81,13 @@ class _Staging:
     outputs: dict[Location, Path] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, verb: str, args: Any) -> _Staging:
+    def of(cls, verb: str, args: Any, scratch: Path | None) -> _Staging:
         found = sorted({str(one) for item in fields(args) if item.name != "settings" for one in _addresses(getattr(args, item.name))})
         key = hashlib.sha256("\n".join([verb, *found]).encode()).hexdigest()[:12]
-        given = getattr(args, "scratch", None)
-        if isinstance(given, Path) and _address(given) is not None:
-            raise UsageError("the scratch folder lies on this machine", where="--scratch", got=str(given))
-        root = Path(tempfile.gettempdir()) if given is None else Path(given)
-        plan = cls(args, root.absolute() / f"mudg-{verb}-{key}")
+        if scratch is not None and _address(scratch) is not None:
+            raise UsageError("the scratch folder lies on this machine", where="--scratch", got=str(scratch))
+        root = Path(tempfile.gettempdir()) if scratch is None else scratch
+        plan = cls(args, root.absolute() / f"mudg-{verb.replace(' ', '-')}-{key}")
         changes = {item.name: plan._placed(item.name, getattr(args, item.name)) for item in fields(args) if item.name != "settings"}
         if plan.inputs or plan.outputs:
             plan.args = replace(args, **changes)
@@ -99,9 +99,8 @@ class _Staging:
         """A flag's value with paths of this machine for addresses."""
         if isinstance(value, tuple):
             return tuple(self._placed(name, one) for one in value)
-        if isinstance(value, str) and "=" in value and scheme_of(value) == "":  # mudg score --views NAME=ADDRESS
-            head, _, tail = value.partition("=")
-            return value if _address(tail) is None else f"{head}={self._placed(name, tail)}"
+        if isinstance(value, Mapping):  # mudg score --views NAME=ADDRESS
+            return {key: self._placed(name, one) for key, one in value.items()}
         location = _address(value) if isinstance(value, str | Path) else None
         if location is None:
             return value
@@ -153,8 +152,9 @@ class _Staging:
 
 
 def _addresses(value: Any) -> Iterator[Location]:
-    for one in value if isinstance(value, tuple) else (value,):
-        found = _address(one.partition("=")[2] if isinstance(one, str) and "=" in one and not scheme_of(one) else one)
+    several = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
+    for one in several:
+        found = _address(one)
         if found is not None:
             yield found
 

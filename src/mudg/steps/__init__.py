@@ -1,0 +1,59 @@
+"""One `Step` per verb, and the table of all verbs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from mudg.steps.step import Step, load
+
+_HOMES: Final[Mapping[str, str]] = {
+    "demo": "mudg.steps.run:Demo",
+    "run": "mudg.steps.run:Run",
+    "doctor": "mudg.steps.doctor:Doctor",
+    "ingest": "mudg.steps.ingest:Ingest",
+    "annotate": "mudg.steps.annotate:Annotate",
+    "fuse": "mudg.steps.fuse:Fuse",
+    "learn": "mudg.steps.learn:Learn",
+    "fit": "mudg.steps.fit:Fit",
+    "adapt": "mudg.steps.adapt:Adapt",
+    "synthesize": "mudg.steps.synthesize:Synthesize",
+    "render": "mudg.steps.render:Render",
+    "score": "mudg.steps.score:Score",
+    "view": "mudg.steps.view:View",
+    "page": "mudg.steps.page:Page",
+    "report": "mudg.steps.report:Report",
+    "edit": "mudg.steps.edit:Edit",
+    "asset export": "mudg.steps.asset:AssetExport",
+    "asset import": "mudg.steps.asset:AssetImport",
+    "export": "mudg.steps.export:Export",
+    "batch run": "mudg.steps.batch:BatchRun",
+    "batch status": "mudg.steps.batch:BatchStatus",
+    "batch retry": "mudg.steps.batch:BatchRetry",
+    "bench": "mudg.steps.bench:Bench",
+    "convert": "mudg.steps.convert:Convert",
+}
+VERBS: Final = tuple(_HOMES)
+"""Names of all verbs, in the order in which the overview lists them."""
+
+
+def step_class(verb: str) -> type[Step]:
+    """The step of a verb; KeyError for a name that is none."""
+    return load(_HOMES[verb])
+
+
+def sections() -> Iterator[tuple[str, list[str]]]:
+    """Titles of the overview, each with its verbs."""
+    by_title: dict[str, list[str]] = {}
+    for verb in VERBS:
+        by_title.setdefault(step_class(verb).section, []).append(verb)
+    yield from by_title.items()
+
+
+def groups() -> dict[str, list[str]]:
+    """Verbs of two words by their first one."""
+    found: dict[str, list[str]] = {}
+    for verb in VERBS:
+        if " " in verb:
+            found.setdefault(verb.split(" ")[0], []).append(verb)
+    return found

@@ -1,0 +1,76 @@
+"""``mudg bench``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from mudg.steps.outputs import Output
+from mudg.steps.run import Preset
+from mudg.steps.step import Flag
+
+if TYPE_CHECKING:
+    from mudg.stages.config import BenchConfig
+
+
+class Bench(Output):
+    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers."""
+
+    section = "benchmarks"
+    examples = (
+        "mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
+        "mudg bench edit runs/a runs/b --out runs/edited",
+        "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
+        "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
+        "mudg bench paper city:reported --table mudg1 --out runs/mudg1",
+        "mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",
+    )  # fmt: skip
+    short = ("model", "seed", "device")
+    parts = {
+        "mdm": "Measure the diffusion model against exact truth.", "poses": "Measure the correction of box tracks.",
+        "edit": "Measure edits of fitted scenes.", "shift": "Measure complete methods off the recorded path, against exact truth.",
+        "real": "Measure complete methods on real logs.", "paper": "Fill a table of a paper.",
+    }  # fmt: skip
+    name: Annotated[str, Flag("BENCHMARK", "first")]
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off
+    the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
+    sources: Annotated[tuple[Path, ...], Flag("[LOG ...]", "rest")] = ()
+    """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
+    generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities."""
+    preset: Preset = "default"
+    """shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the
+    published set-up, with a published-type model."""
+    settings: BenchConfig
+
+    @classmethod
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> BenchConfig:
+        """Preset, then the file, then single settings."""
+        from mudg.base import config as configuration
+        from mudg.stages import config as c
+
+        return configuration.load(c.BenchConfig, c.bench_preset(inputs["preset"]), file, given)
+
+    @classmethod
+    def applies(cls, part: str, name: str, text: str) -> bool:
+        """Texts of flags that not all benchmarks take begin with those that do."""
+        if name == "name":
+            return False
+        if "." in name:
+            return part == "paper" or (not name.startswith("score.") and part in ("shift", "real"))
+        tags = [re.findall(r"[a-z0-9]+", tag) for tag in re.findall(r"(?:^|\. )([a-z0-9,; ]+): ", text)]
+        named = {word for tag in tags for word in tag if word in cls.parts}
+        return not named or part in named
+
+    def run(self) -> Path:
+        from mudg.bench import run as bench
+
+        return bench.run(
+            self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite
+        )
+
+    def answer(self, outcome: Any) -> dict[str, Any]:
+        from mudg.base import store
+
+        return {"bench": outcome / "bench.json", "text": store.read_text(outcome / "bench.md")}

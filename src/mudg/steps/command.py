@@ -1,0 +1,268 @@
+"""Command lines: words to a `Step`, and the pages of help. Both follow from the step's declaration."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import shutil
+import textwrap
+import typing
+from collections.abc import Iterable, Sequence
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import Any, Literal, NoReturn, get_args, get_origin
+
+from mudg.base import config as configuration
+from mudg.base.errors import UsageError, nearest
+from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, positions, usage
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """Flags that every command has."""
+
+    config: Path | None = None
+    """Read settings from this YAML file; flags win over it. The run.yaml beside any result is such a file."""
+    quiet: bool = False
+    """Show warnings and the result only: no progress bars, no messages."""
+    json: bool = False
+    """Print the result as JSON."""
+    scratch: Path | None = None
+    """Where inputs and outputs that are addresses (s3://bucket/folder) lie while the command works on them (not given: the system's folder
+    for temporary files)."""
+    debug: bool = False
+    """Show the full traceback of an error."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message[:1].lower() + message[1:], remedy=f"see {self.prog} --help")
+
+
+def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
+    """The words behind a verb as its step, and the flags that every command has.
+
+    Raises:
+        UsageError: an unknown flag (the nearest is named), a missing or wrong value. InputError: --config cannot be read.
+    """
+    listed = {option.name: option for option in _all_options(cls)}
+    parser = _Parser(prog=f"mudg {cls.verb()}", add_help=False, allow_abbrev=False)
+    for option in listed.values():
+        _add(parser, option)
+    parser.add_argument("words", nargs="*")
+    found, unknown = parser.parse_known_intermixed_args(_second_named(cls, _plain_flags(words)))
+    if unknown:
+        _refuse_unknown(cls, unknown[0], listed)
+    given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
+    own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
+    its_own = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    common = Common(
+        **{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own}
+    )
+    by_words = cls.from_words(found.words)
+    for name in by_words.keys() & own.keys():
+        raise UsageError(
+            f"{flag_name(name)} was given twice", got=f"{by_words[name]!r} and {own[name]!r}", expected=usage(cls)
+        )
+    common = dataclasses.replace(
+        common,
+        **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)},
+    )
+    settings = configuration.nested({name: _value(listed[name].kind, value) for name, value in given.items()})
+    return cls.build({**by_words, **own}, settings, common.config), common
+
+
+def _all_options(cls: type[Step]) -> list[Option]:
+    """Flags of a step and those of every command; a step that has one of its own keeps it."""
+    own = list(options(cls))
+    names = {option.name for option in own}
+    return [*own, *(option for option in common_options() if option.name not in names)]
+
+
+def common_options() -> list[Option]:
+    """Flags that every command has."""
+    return list(options(Common))
+
+
+def _add(parser: argparse.ArgumentParser, option: Option) -> None:
+    flag, about = flag_name(option.name), dict[str, Any](dest=option.name, default=argparse.SUPPRESS)
+    if option.kind is bool:
+        parser.add_argument(flag, action="store_true", **about)
+        parser.add_argument(_negated(option.name), action="store_false", **about)
+    elif is_many(option.kind):
+        parser.add_argument(flag, nargs="*", **about)
+    else:
+        parser.add_argument(flag, **about)
+
+
+def _negated(name: str) -> str:
+    """``render.video`` as ``--render.no-video``."""
+    group, dot, last = name.rpartition(".")
+    return flag_name(f"{group}{dot}no_{last}")
+
+
+def _plain_flags(words: Iterable[str]) -> list[str]:
+    """Underscores in flags as dashes."""
+    plain = []
+    for word in words:
+        head, equals, value = word.partition("=")
+        plain.append(head.replace("_", "-") + equals + value if word.startswith("--") else word)
+    return plain
+
+
+def _second_named(cls: type[Step], words: list[str]) -> list[str]:
+    """The second of two words before all flags as the input it stands for: ``render SCENE FIT`` as ``render SCENE --model FIT``."""
+    second = next((name for name in positions(cls) if flag_of(cls, name).position == "second"), None)
+    if second is None or len(words) < 2 or any(word.startswith("-") for word in words[:2]):
+        return words
+    flag = flag_name(second)
+    given = any(word == flag or word.startswith(f"{flag}=") for word in words)
+    return words if given else [words[0], flag, *words[1:]]
+
+
+def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:
+    flag = word.partition("=")[0]
+    known = [flag_name(name) for name in listed]
+    near = nearest(flag, known, 0.6) or next(
+        (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4), None
+    )
+    raise UsageError(
+        f"mudg {cls.verb()} has no flag {flag}",
+        remedy=f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all",
+    )
+
+
+def _value(kind: Any, value: Any) -> Any:
+    """The words of a flag as the plain value that its type is checked against."""
+    if isinstance(value, list):
+        if get_origin(kind) is tuple:
+            inner = get_args(kind)[0]
+            return tuple(_value(inner, word) for word in value)
+        pairs = [word.partition("=") for word in value]
+        for name, equals, folder in pairs:
+            if not equals or not name or not folder:
+                raise UsageError(
+                    "a value is not a name and a folder",
+                    expected="NAME=FOLDER",
+                    got="=".join(filter(None, (name, folder))),
+                )
+        return {name: folder for name, _, folder in pairs}
+    if isinstance(value, str):
+        if value == "None" and type(None) in get_args(kind):
+            return None
+        choices = [choice for choice in get_args(kind) if get_origin(kind) is Literal and not isinstance(choice, str)]
+        return next((choice for choice in choices if str(choice) == value), value)
+    return value
+
+
+# help ------------------------------------------------------------------------------------------------------------------
+
+_FLAG_COLUMNS = 26
+
+
+def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
+    """A verb's page of help.
+
+    Args:
+        everything: all settings with their whole texts; else those that most people need, with the first sentence of each.
+        part: only what this part of the verb takes.
+    """
+    head = f"mudg {cls.verb()}{f' {part}' if part else ''}"
+    examples = [line for line in cls.examples if line.startswith(f"{head} ") or not part]
+    shown = examples if everything or part else examples[:3]
+    lines = [
+        f"{cls.parts[part] if part else cls.summary()}",
+        "",
+        f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}",
+    ]
+    if shown:
+        lines += ["", "examples:", *(f"  {line}" for line in shown)]
+    if cls.parts and not part:
+        lines += ["", f"mudg {cls.verb()} WORD --help, for each of: " + ", ".join(cls.parts)]
+    own = [one for one in options(cls) if one.own]
+    base = None if cls.settings_type() is None else cls.settings_from(_defaults(own), None, {})
+    settings = [one for one in options(cls, base) if not one.own]
+    if part:
+        own, settings = ([one for one in rows if cls.applies(part, one.name, one.text)] for rows in (own, settings))
+    hidden = 0
+    if not everything and cls.short and not part:
+        chosen = [one for one in settings if one.name in cls.short]
+        hidden, settings = len(settings) - len(chosen), chosen
+    names = {one.name for one in own}
+    common = [one for one in common_options() if one.name not in names]
+    for title, rows in (
+        ("inputs and outputs:", own),
+        ("settings:", settings),
+        ("every command:", common if everything else []),
+    ):
+        if rows:
+            lines += ["", title, *(line for one in rows for line in _row(cls, one, everything))]
+    if not everything:
+        short = " ".join(flag_name(one.name) + (" PATH" if one.kind is not bool else "") for one in common)
+        lines += [
+            "",
+            f"every command: {short}",
+            *([f"{hidden} more settings, and longer texts: mudg {cls.verb()} --help-all"] if hidden else []),
+        ]
+    return "\n".join(lines)
+
+
+def _defaults(own: Sequence[Option]) -> dict[str, Any]:
+    return {option.name: option.default for option in own if option.default is not MISSING}
+
+
+def _row(cls: type[Step], option: Option, whole: bool) -> list[str]:
+    """The lines of one flag."""
+    position, metavar = "", ""
+    if option.own and option.name in {field.name for field in dataclasses.fields(cls)}:  # type: ignore[arg-type]
+        about = flag_of(cls, option.name)
+        position, metavar = about.position, about.metavar
+    head = flag_name(option.name)
+    if position in ("first", "rest"):
+        head = metavar
+    elif option.kind is bool:
+        group, dot, last = option.name.rpartition(".")
+        head = flag_name(f"{group}{dot}[no-]{last}") if option.default is True else head
+    else:
+        head = f"{head} {metavar or metavar_of(option.kind)}"
+    text = option.text if whole else _first_sentence(option.text)
+    switch = "default: on" if option.default is True else ""
+    default = switch if option.kind is bool else "" if position in ("first", "rest") else default_words(option.default)
+    text = f"{text} ({default})" if default and "(not given:" not in text else text
+    width = max(60, min(140, int(os.environ.get("COLUMNS") or 0) or shutil.get_terminal_size((120, 24)).columns))
+    body = textwrap.wrap(text, width - _FLAG_COLUMNS - 2, break_long_words=False, break_on_hyphens=False) or [""]
+    first = [f"  {head}"] if len(head) > _FLAG_COLUMNS - 2 else [f"  {head:<{_FLAG_COLUMNS - 2}}  {body.pop(0)}"]
+    return [*first, *(" " * (_FLAG_COLUMNS + 2) + line for line in body)]
+
+
+def _first_sentence(text: str) -> str:
+    for end in range(len(text)):
+        if text[end] == "." and text[end + 1 : end + 2] in ("", " ") and text[end + 2 : end + 3].isupper():
+            return text[:end]
+    return text.rstrip(".")
+
+
+def metavar_of(kind: Any) -> str:
+    """What stands for a value of a type."""
+    if is_many(kind):
+        if get_origin(kind) is not tuple:
+            return "NAME=FOLDER ..."
+        return " ".join([metavar_of(get_args(kind)[0]), "..."])
+    if get_origin(kind) is typing.Annotated:
+        return metavar_of(get_args(kind)[0])
+    if get_origin(kind) is Literal:
+        return "{" + ",".join(map(str, get_args(kind))) + "}"
+    inside = [one for one in get_args(kind) if one is not type(None)]
+    if inside:
+        return metavar_of(inside[0])
+    return {int: "INT", float: "FLOAT", Path: "PATH"}.get(kind, "TEXT")
+
+
+def default_words(value: Any) -> str:
+    """``default: 3`` of a value; empty for none."""
+    if value is MISSING:
+        return "required"
+    if value is None or value == () or value == "":
+        return ""
+    return "default: " + (" ".join(map(str, value)) if isinstance(value, tuple) else str(value))

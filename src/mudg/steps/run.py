@@ -1,0 +1,89 @@
+"""``mudg run`` and ``mudg demo``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from mudg.steps.outputs import Output
+from mudg.steps.step import Flag
+
+if TYPE_CHECKING:
+    from mudg.stages.config import RunConfig
+
+Preset = Literal["fast", "default", "quality", "paper"]
+
+
+class Run(Output):
+    """Run all steps on your own driving log or scene and write a report page."""
+
+    section = "start here"
+    examples = (
+        "mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti",
+        "mudg run scenes/a --out runs/a --preset quality",
+    )
+    short = ("device", "adaptation", "continue_fit")
+    source: Annotated[str, Flag("SOURCE", "first")]
+    """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
+    preset: Preset | None = None
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000
+    iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
+    fast: bool = False
+    """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side, no adaptation. One to two minutes on 2 cores for
+    16 frames of one camera; a line at the start forecasts what it takes here."""
+    seed: Annotated[int | None, Flag("INT")] = None
+    """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
+    cameras: tuple[str, ...] = ()
+    """Cameras for which shifted trajectories are made (not given: the first camera)."""
+    shifts_m: tuple[float, ...] = ()
+    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize,
+    render and score."""
+    settings: RunConfig
+
+    @classmethod
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> RunConfig:
+        """Preset, then the file, then seed, cameras and shifts, then settings of single steps."""
+        from mudg.base import config as configuration
+        from mudg.stages import config as c
+
+        made = configuration.load(c.RunConfig, c.run_preset(c.chosen_preset(inputs["preset"], inputs["fast"])), file)
+        made = made if inputs["seed"] is None else c.with_seed(made, inputs["seed"])
+        made = c.with_lines(made, cameras=inputs.get("cameras") or None, shifts_m=inputs["shifts_m"] or None)
+        return configuration.load(c.RunConfig, made, None, given)
+
+    def run(self) -> dict[str, Any]:
+        from mudg.stages import run
+
+        return run.run_chain(self.settings, self.source, self.out, overwrite=self.overwrite)
+
+
+class Demo(Output):
+    """Run all steps on the built-in city and write a report page."""
+
+    section = "start here"
+    examples = ("mudg demo", "mudg demo --fast --out runs/first", "mudg demo --seed 7 --out city7")
+    short = ("device", "adaptation", "continue_fit")
+    out: Annotated[Path, Flag()] = Path("mudg_demo")
+    """Folder to write. Repeat the same command to resume an interrupted demo."""
+    preset: Preset | None = None
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000
+    iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
+    fast: bool = False
+    """The same as --preset fast, 3 m to each side: about a minute on 2 cores."""
+    seed: Annotated[int | None, Flag("INT")] = None
+    """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
+    shifts_m: tuple[float, ...] = ()
+    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize,
+    render and score."""
+    settings: RunConfig
+
+    @classmethod
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> RunConfig:
+        """As for mudg run."""
+        return Run.settings_from(inputs, file, given)
+
+    def run(self) -> dict[str, Any]:
+        from mudg.stages import run
+
+        return run.run_chain(self.settings, "city", self.out, overwrite=self.overwrite)

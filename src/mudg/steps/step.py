@@ -1,0 +1,460 @@
+"""A verb is a `Step`: one frozen dataclass of what it reads, writes and can be told. Command line, Python function, help and checks of
+its inputs follow from the declaration. Imports neither torch nor pydantic before a step is built."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import dataclasses
+import importlib
+import inspect
+import sys
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_args, get_origin, get_type_hints
+
+from mudg.base.errors import UsageError, nearest
+
+if typing.TYPE_CHECKING:
+    from pydantic import ValidationError
+
+
+@dataclass(frozen=True, slots=True)
+class Flag:
+    """What the command line knows of a field beyond its name, type, default and text.
+
+    Args:
+        metavar: what stands for the value in the help.
+        position: "first": a word without a flag. "second": its word may also follow the first one without the flag. "rest": all further
+            words.
+        part: the part of a run that the field reads ("scene", "fused", "model", "fitted", "start_from", "views"): the folder of a run
+            is taken for it.
+    """
+
+    metavar: str = "FOLDER"
+    position: Literal["", "first", "second", "rest"] = ""
+    part: str = ""
+
+
+SCENE = Flag("SCENE", "first", "scene")
+RUN = Flag("RUN", "first")
+FILE_YAML = Flag("FILE.yaml")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+class Step:
+    """Base of all verbs. A subclass is a frozen dataclass by being one; the first line of its docstring is its summary.
+
+    Fields are what it reads (with a `Flag`), `out`, `overwrite`, and `settings`: a frozen configuration whose fields are flags, too. The
+    text below a field is its help.
+    """
+
+    section: ClassVar[str] = ""
+    examples: ClassVar[tuple[str, ...]] = ()
+    smaller: ClassVar[str] = ""
+    """The settings that make its work need less memory."""
+    result: ClassVar[str] = "out"
+    """What the command calls the path that `run` returns."""
+    short: ClassVar[tuple[str, ...]] = ()
+    """Settings that `--help` lists; `--help-all` lists all. Empty: all."""
+    parts: ClassVar[Mapping[str, str]] = {}
+    """First words that choose what the verb does, each with a page of help of its own, and what each does."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
+
+    def run(self) -> Any:
+        """Do it. Returns the path of the result, or what the command shows by name."""
+        raise NotImplementedError
+
+    def answer(self, outcome: Any) -> dict[str, Any]:
+        """What the command shows: names and values; `text` stands for all others where people read it."""
+        return outcome if isinstance(outcome, dict) else {self.result: outcome}
+
+    def required(self) -> tuple[str, ...]:
+        """Inputs that come from the run at `scene` where they are not given."""
+        return ()
+
+    @classmethod
+    def from_words(cls, words: Sequence[str]) -> dict[str, Any]:
+        """Values of fields by the words without a flag.
+
+        Raises:
+            UsageError: a word is missing or too many.
+        """
+        left, values, names = list(words), dict[str, Any](), positions(cls)
+        for name in names:
+            kind, field = hint_of(cls, name), field_of(cls, name)
+            rest = flag_of(cls, name).position == "rest"
+            if not left:
+                if field.default is MISSING and flag_of(cls, name).position in ("first", "rest"):
+                    raise UsageError(f"no {flag_of(cls, name).metavar.strip('[]')} was given", expected=usage(cls))
+            elif rest and is_many(kind):
+                values[name], left = left, []
+            else:
+                values[name] = left.pop(0)
+        if left:
+            raise UsageError(
+                "too many words",
+                expected=usage(cls),
+                got=" ".join(map(repr, left)),
+                remedy="a value needs its flag before it",
+            )
+        return values
+
+    @classmethod
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> Any:
+        """The settings: defaults, then a YAML file, then nested values; those behind later ones win."""
+        from mudg.base import config as configuration
+
+        return configuration.load(cls.settings_type(), None, file, given)
+
+    @classmethod
+    def settings_type(cls) -> Any:
+        """Class of the settings, or None."""
+        return hints(cls).get("settings")
+
+    @classmethod
+    def applies(cls, part: str, name: str, text: str) -> bool:
+        """Whether a part of the verb takes a field or setting, by its dotted name and its text."""
+        return True
+
+    @classmethod
+    def build(
+        cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None
+    ) -> Self:
+        """The step of plain values, as they come from a command line or a caller.
+
+        Args:
+            values: of the fields. settings: nested values of settings. file: YAML of settings.
+
+        Raises:
+            UsageError: a value is missing, unknown or not valid. InputError: the file cannot be read.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        known = {field.name: field for field in fields(cls) if field.name != "settings"}  # type: ignore[arg-type]
+        checked: dict[str, Any] = {}
+        for name, value in values.items():
+            if name not in known:
+                raise UsageError(f"{cls.verb()} has no {name!r}", expected=", ".join(known))
+            kind = hint_of(cls, name)
+            if kind == tuple[Path, ...] and isinstance(value, str | Path):
+                value = (value,)
+            try:
+                checked[name] = TypeAdapter(kind).validate_python(value)
+            except ValidationError as error:
+                raise refused(cls, name, error) from error
+        missing = [name for name, field in known.items() if name not in checked and field.default is MISSING]
+        if missing:
+            raise UsageError(
+                f"no {shown_name(cls, missing[0])} was given",
+                expected=usage(cls),
+                remedy=f"see mudg {cls.verb()} --help",
+            )
+        if cls.settings_type() is not None:
+            defaults = {name: field.default for name, field in known.items()} | checked
+            checked["settings"] = cls.settings_from(defaults, file, settings or {})
+        return cls(**checked)
+
+    @classmethod
+    def verb(cls) -> str:
+        """Its name on the command line."""
+        return cls.__name__.lower()
+
+    @classmethod
+    def summary(cls) -> str:
+        """What it does, in a line."""
+        return (cls.__doc__ or "").strip().splitlines()[0]
+
+
+def perform(step: Step) -> Any:
+    """Run a step; where it takes a part of a run, the folder of a run will do."""
+    parts = [field.name for field in fields(step) if flag_of(type(step), field.name).part]  # type: ignore[arg-type]
+    if parts:
+        from mudg.stages.editing import runs
+
+        found = runs.parts_of({name: getattr(step, name) for name in parts if name != "views"}, step.required())
+        if "views" in parts:
+            found["views"] = {name: runs.views_at(path, name) for name, path in step.views.items()}  # type: ignore[attr-defined]
+        step = replace(step, **found)  # type: ignore[type-var]
+    return step.run()
+
+
+# what a declaration says -----------------------------------------------------------------------------------------------
+
+
+class _Settings(dict[str, Any]):
+    """Names that annotations of steps use and that only type checkers import: classes of settings, looked up when needed."""
+
+    def __missing__(self, name: str) -> Any:
+        from mudg.stages import config
+
+        try:
+            return getattr(config, name)
+        except AttributeError:
+            raise KeyError(name) from None
+
+
+def hints(cls: type[Any]) -> dict[str, Any]:
+    """Types of the fields of a step or of settings, with their `Flag` where they have one."""
+    return get_type_hints(cls, localns=_Settings(), include_extras=True)
+
+
+def hint_of(cls: type[Any], name: str) -> Any:
+    """Type of a field, without its `Flag`."""
+    kind = hints(cls)[name]
+    return (
+        get_args(kind)[0]
+        if get_origin(kind) is Annotated and any(isinstance(item, Flag) for item in get_args(kind)[1:])
+        else kind
+    )
+
+
+def flag_of(cls: type[Any], name: str) -> Flag:
+    """What the command line knows of a field."""
+    kind = hints(cls)[name]
+    return (
+        next((item for item in get_args(kind)[1:] if isinstance(item, Flag)), Flag(""))
+        if get_origin(kind) is Annotated
+        else Flag("")
+    )
+
+
+def field_of(cls: type[Any], name: str) -> Any:
+    """The dataclass field of a name."""
+    return next(field for field in fields(cls) if field.name == name)
+
+
+def positions(cls: type[Any]) -> list[str]:
+    """Fields whose values may stand without their flag, in order."""
+    return [field.name for field in fields(cls) if flag_of(cls, field.name).position]
+
+
+def is_many(kind: Any) -> bool:
+    """Whether a flag takes several words."""
+    return get_origin(kind) is tuple or (isinstance(get_origin(kind), type) and issubclass(get_origin(kind), Mapping))
+
+
+def flag_name(name: str) -> str:
+    """``loss.ssim_weight`` as ``--loss.ssim-weight``."""
+    return f"--{name.replace('_', '-')}"
+
+
+def shown_name(cls: type[Any], name: str) -> str:
+    """A field as people write it: its word, or its flag."""
+    flag = flag_of(cls, name)
+    return flag.metavar.strip("[]") if flag.position in ("first", "rest") else flag_name(name)
+
+
+def usage(cls: type[Step]) -> str:
+    """The command line of a step in short."""
+    words = [f"mudg {cls.verb()}"]
+    for field in in_reading_order(cls):
+        flag, needed = flag_of(cls, field.name), field.default is MISSING
+        if flag.position in ("first", "rest"):
+            words.append(flag.metavar if needed or "[" in flag.metavar else f"[{flag.metavar}]")
+        elif needed:
+            words.append(f"{flag_name(field.name)} {flag.metavar}")
+    return " ".join([*words, "[flags]"])
+
+
+def in_reading_order(cls: type[Any]) -> list[dataclasses.Field[Any]]:
+    """Fields but the settings: words without a flag, what has to be given, then the rest."""
+    own = [field for field in fields(cls) if field.name != "settings"]
+
+    def rank(field: dataclasses.Field[Any]) -> int:
+        if flag_of(cls, field.name).position in ("first", "rest"):
+            return 0
+        return (
+            1
+            + (flag_of(cls, field.name).position != "second")
+            + (field.default is not MISSING or field.name == "overwrite")
+        )
+
+    return sorted(own, key=rank)
+
+
+def refused(cls: type[Step], name: str, error: ValidationError) -> UsageError:
+    """The first wrong value of a field in words."""
+    first = error.errors(include_url=False)[0]
+    return UsageError(
+        "a value is not valid", where=shown_name(cls, name), expected=first["msg"], got=repr(first.get("input"))[:120],
+        remedy=f"see mudg {cls.verb()} --help",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """A field of a step, or one of its settings.
+
+    Args:
+        name: dotted, without the word settings. kind: its type. default: `MISSING` where it has none. text: its help. own: not a setting.
+    """
+
+    name: str
+    kind: Any
+    default: Any
+    text: str
+    own: bool
+
+
+def options(cls: type[Any], base: Any = None) -> Iterator[Option]:
+    """Every flag of a step, or of another dataclass of flags, its own before its settings.
+
+    Args:
+        base: settings whose values are the defaults (None: those of their class).
+    """
+    texts = texts_of(cls)
+    for field in in_reading_order(cls):
+        yield Option(field.name, hint_of(cls, field.name), field.default, texts.get(field.name, ""), True)
+    kind = hints(cls).get("settings")
+    if kind is not None:
+        yield from _setting_options(kind, kind() if base is None else base, "")
+
+
+def _setting_options(kind: Any, values: Any, path: str) -> Iterator[Option]:
+    texts, types = texts_of(kind), hints(kind)
+    for field in fields(kind):
+        value, name = getattr(values, field.name), f"{path}{field.name}"
+        if is_dataclass(value):
+            yield from _setting_options(type(value), value, f"{name}.")
+        else:
+            kind = types[field.name]
+            kind = (
+                get_args(kind)[0] if get_origin(kind) is Annotated else kind
+            )  # constraints do not matter to the command line
+            yield Option(name, kind, value, texts.get(field.name, ""), False)
+
+
+def texts_of(kind: type[Any]) -> dict[str, str]:
+    """By field: the string that stands below it in the source, as one line; of inherited fields, too. Empty without a source file."""
+    texts: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if base.__dict__.get("__annotations__"):
+            texts |= _texts_of_module(getattr(sys.modules[base.__module__], "__file__", None) or "").get(
+                base.__qualname__, {}
+            )
+    return texts
+
+
+_TEXTS: dict[str, dict[str, dict[str, str]]] = {}
+
+
+def _texts_of_module(source: str) -> dict[str, dict[str, str]]:
+    """Texts by class and field of one source file, read once."""
+    if source not in _TEXTS:
+        _TEXTS[source] = {}
+        with contextlib.suppress(OSError):
+            for node in ast.parse(Path(source).read_bytes()).body:
+                if isinstance(node, ast.ClassDef):
+                    _TEXTS[source][node.name] = dict(_texts_of_class(node))
+    return _TEXTS[source]
+
+
+def _texts_of_class(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
+    for field, below in zip(node.body, node.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
+            if isinstance(below.value, ast.Constant) and isinstance(below.value.value, str):
+                yield field.target.id, " ".join(below.value.value.split())
+
+
+# the function of a verb ------------------------------------------------------------------------------------------------
+
+
+def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
+    """``mudg.fit(...)`` of a step: its inputs and settings as arguments, its result returned.
+
+    A setting has the name and default that the command shows, without the dashes; a group of settings is a dictionary, or its
+    configuration. ``config`` names a YAML file that is read before the settings.
+    """
+
+    def call(*args: Any, config: str | Path | None = None, **given: Any) -> Any:
+        names = [
+            parameter.name
+            for parameter in inspect.signature(call).parameters.values()
+            if parameter.kind != inspect.Parameter.KEYWORD_ONLY
+        ]
+        if len(args) > len(names):
+            raise UsageError(
+                f"mudg.{name} takes {len(names)} arguments without a name",
+                expected=", ".join(names),
+                got=f"{len(args)} of them",
+            )
+        values = dict(zip(names, args, strict=False))
+        twice = sorted(values.keys() & given.keys())
+        if twice:
+            raise UsageError(f"mudg.{name} was given {twice[0]} twice")
+        own = {field.name for field in fields(cls) if field.name != "settings"}  # type: ignore[arg-type]
+        values |= {key: value for key, value in given.items() if key in own}
+        settings = {key: _plain(value) for key, value in given.items() if key not in own}
+        if settings and cls.settings_type() is None:
+            near = nearest(next(iter(settings)), own, 0.5)
+            raise UsageError(f"mudg.{name} has no argument {next(iter(settings))!r}", expected=", ".join(sorted(own)),
+                remedy=f"did you mean {near}?" if near else "")  # fmt: skip
+        outcome = perform(cls.build(values, settings, None if config is None else Path(config)))
+        return outcome[cls.result] if isinstance(outcome, dict) and cls.result in outcome else outcome
+
+    call.__name__ = call.__qualname__ = name
+    call.__module__ = "mudg"
+    call.__signature__ = signature(cls)  # type: ignore[attr-defined]
+    call.__doc__ = documentation(cls)
+    return call
+
+
+def _plain(value: Any) -> Any:
+    """Settings hold plain values: paths as text, groups as mappings."""
+    if is_dataclass(value) and not isinstance(value, type):
+        from mudg.base import config as configuration
+
+        return configuration.to_dict(value)
+    if isinstance(value, Mapping):
+        return {name: _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def signature(cls: type[Step]) -> inspect.Signature:
+    """Arguments of the function: inputs in order, then by name alone the output, other inputs, the YAML file and every setting."""
+    kinds = inspect.Parameter
+    first, later = [], []
+    for field in fields(cls):  # type: ignore[arg-type]
+        if field.name == "settings":
+            continue
+        at = kinds.POSITIONAL_OR_KEYWORD if flag_of(cls, field.name).position else kinds.KEYWORD_ONLY
+        default = kinds.empty if field.default is MISSING else field.default
+        (first if at == kinds.POSITIONAL_OR_KEYWORD else later).append(
+            kinds(field.name, at, default=default, annotation=hint_of(cls, field.name))
+        )
+    kind = cls.settings_type()
+    names = {one.name for one in (*first, *later)}
+    if kind is not None:
+        if "config" not in names:
+            later.append(kinds("config", kinds.KEYWORD_ONLY, default=None, annotation=Path | None))
+        types, values = hints(kind), kind()
+        later += [
+            kinds(field.name, kinds.KEYWORD_ONLY, default=getattr(values, field.name), annotation=types[field.name])
+            for field in dataclasses.fields(kind)
+        ]
+    first.sort(key=lambda one: one.default is not kinds.empty)
+    later.sort(key=lambda one: one.default is not kinds.empty)
+    return inspect.Signature([*first, *later])
+
+
+def documentation(cls: type[Step]) -> str:
+    """The docstring of the function: the step's own, then a line per argument."""
+    lines = [inspect.cleandoc(cls.__doc__ or ""), "", "Args:"]
+    texts = texts_of(cls) | (texts_of(cls.settings_type()) if cls.settings_type() is not None else {})
+    for name in signature(cls).parameters:
+        text = texts.get(name) or ("YAML file of settings, read before those given here." if name == "config" else "")
+        lines.append(f"    {name}: {text}".rstrip())
+    return "\n".join(lines)
+
+
+def load(home: str) -> type[Step]:
+    """The class behind ``module:Class``."""
+    module, _, name = home.partition(":")
+    return getattr(importlib.import_module(module), name)
