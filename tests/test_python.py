@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import mudg
+from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 
@@ -105,3 +107,25 @@ def test_settings_take_path_objects(notebook: dict[str, Any], tmp_path: Path) ->
     folder = notebook["folder"]
     with pytest.raises(InputError, match="no diffusion model here"):
         mudg.synthesize(folder / "scene", folder / "fused", out=tmp_path / "a", model=tmp_path / "none")
+
+
+def test_a_fit_knows_its_scene_until_that_changes(notebook: dict[str, Any], tmp_path: Path) -> None:
+    for name in ("scene", "fused", "fit"):
+        shutil.copytree(notebook["folder"] / name, tmp_path / "a" / name)
+    (tmp_path / "a").rename(tmp_path / "b")  # what lies beside each other may move together
+    folder = tmp_path / "b"
+    assert [frame.id for frame in mudg.read_scene(folder / "fit").frames] == [frame.id for frame in mudg.read_scene(folder / "scene").frames]
+    views = mudg.render(folder / "fit", out=tmp_path / "views", cameras=("front",), shifts_m=(0.0,), video=False)
+    assert store.read_json(views / "run.json")["inputs"].keys() == {"scene", "model"}
+    assert mudg.page(folder / "fit", out=tmp_path / "fit.html").is_file()
+    assert mudg.page(folder / "fit", out=tmp_path / "fit.html").is_file()
+    (notebook["folder"] / "scene").rename(notebook["folder"] / "hidden")
+    try:
+        shutil.rmtree(folder / "scene")
+        with pytest.raises(UsageError, match="is not known, is gone or has changed"):
+            mudg.page(folder / "fit", out=tmp_path / "other.html")
+        shutil.copytree(folder / "fused", folder / "scene")  # something else at its place
+        with pytest.raises(InputError, match="not a scene"):
+            mudg.read_scene(folder / "fit")
+    finally:
+        (notebook["folder"] / "hidden").rename(notebook["folder"] / "scene")

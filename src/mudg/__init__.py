@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from mudg.base.types import Camera, Gaussians, Observation, PointCloud, Render, Scene, Track, Trajectory, View
     from mudg.core.raster.rasterize import rasterize
     from mudg.data.observations import read_observations
-    from mudg.data.scene import read_scene
-    from mudg.fitted import FittedScene, Picture
+    from mudg.fitted import FittedScene, Picture, read_scene
 
 __version__ = "0.1.0"
 
@@ -43,7 +42,7 @@ _HOMES = {
     "View": "mudg.base.types",
     "rasterize": "mudg.core.raster.rasterize",
     "read_observations": "mudg.data.observations",
-    "read_scene": "mudg.data.scene",
+    "read_scene": "mudg.fitted",
 }
 
 _VERBS = {

@@ -34,6 +34,18 @@ class Picture:
     coverage: NDArray[np.float32]
 
 
+def read_scene(folder: str | Path) -> Scene:
+    """Read a scene written by ingest or annotate, the one of a run, or the one that a fit belongs to.
+
+    Raises:
+        InputError: nothing is there, or something else. IntegrityError: a file was altered.
+    """
+    from mudg.data.scene import read_scene
+    from mudg.stages.editing.runs import scene_at
+
+    return read_scene(scene_at(Path(folder)))
+
+
 class FittedScene:
     """A scene made by ``mudg fit``. Edits return a changed copy."""
 

@@ -184,6 +184,19 @@ def run_state(folder: Path) -> dict[str, Any]:
     return state
 
 
+def known_input(folder: Path, name: str) -> Path | None:
+    """Where an input of a finished result lies, as seen from the result or from the root; None if it is not known, is gone or has changed."""
+    try:
+        state = store.read_json(folder / _STATE)
+        places, digest = state["paths"][name], state["inputs"][name]
+        for place in (folder / places[0], Path(places[1])):
+            if place.exists() and store.digest(place) == digest:
+                return place
+    except (InputError, KeyError, TypeError, IndexError):
+        pass
+    return None
+
+
 def _what_is(path: Path) -> str:
     if path.is_symlink() and not path.exists():
         return f"a link that leads nowhere: {os.readlink(path)}"
@@ -267,6 +280,7 @@ class RunDir:
         self._made_folder = path != out or not path.is_dir()
         self._meter = Meter()
         self._earlier: Usage | None = None
+        self._paths: dict[str, list[str]] = {}
         self._seen: Mapping[str, Any] = {}
         """What the folder's record said when it was opened."""
 
@@ -278,6 +292,7 @@ class RunDir:
         config: Mapping[str, Any],
         inputs: Mapping[str, str],
         overwrite: bool = False,
+        paths: Mapping[str, Path | None] | None = None,
     ) -> RunDir:
         """Open ``path`` for this verb, configuration and inputs. Call ``refuse_overlap`` first.
 
@@ -285,7 +300,7 @@ class RunDir:
         returns at once. An unfinished run with the same key is continued, also one that is to replace another result.
 
         Args:
-            inputs: name -> digest of what is read.
+            inputs: name -> digest of what is read. paths: name -> where it lies, for who asks the result later (`known_input`).
             overwrite: replace a result of another key, or one that was altered, as soon as the new one is finished.
 
         Raises:
@@ -317,6 +332,7 @@ class RunDir:
                 remove_files(work, own(work))
             replacement.begin()
         run = cls(out, work, output, key, inputs)
+        run._paths = {name: [os.path.relpath(path, out), str(Path(path).absolute())] for name, path in (paths or {}).items() if path}
         run._seen = state if work == out else run_state(work)
         if work != out and staged.get("key") == key and _is_finished(work):
             _drop_lock_of_the_dead(work / _LOCK)
@@ -349,7 +365,7 @@ class RunDir:
         values = {
             "schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state,
             **spent, "written_bytes": self._written_bytes(), "files": list(self._output.files), "environment": environment(),
-            "summary": dict(summary),
+            "summary": dict(summary), **({"paths": self._paths} if self._paths else {}),
         }  # fmt: skip
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
 

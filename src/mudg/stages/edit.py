@@ -70,7 +70,7 @@ def run(
     if config.harmonize.on and loaded is not None:
         check_paths(config.harmonize, {name: len(loaded.frames_of(name)) for name in loaded.cameras if loaded.frames_of(name)})
     made = drive.model(model, keep_ego=not parts.whole)
-    folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
+    folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite, {} if parts.whole else {"scene": place, "fused": clouds})
     if folder.complete:
         return folder.reused()
     changed: dict[str, Any] = {

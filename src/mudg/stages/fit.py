@@ -152,7 +152,7 @@ def run(
     check_drawing(config, device)
     # Clouds without boxes are fused again here; results of methods that took the one of `mudg fuse` are made again.
     output = OUTPUT if METHODS[config.method].boxes else replace(OUTPUT, version=OUTPUT.version + 1)
-    folder = RunDir.open(out, output, result_settings(config), inputs, overwrite)
+    folder = RunDir.open(out, output, result_settings(config), inputs, overwrite, {"scene": scene, "fused": fused})
     if folder.complete:
         return folder.reused()
     config = recipe_of(config.method).used(config)
@@ -176,7 +176,7 @@ def _run_radiance(config: FitConfig, scene: Path, out: Path, start: Path | None,
         raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave --start-from out")
     refuse_overlap(out, {"scene": scene})
     device = choose_device(config.device, "fit")
-    folder = RunDir.open(out, OUTPUT, result_settings(config), {"scene": store.digest(scene)}, overwrite)
+    folder = RunDir.open(out, OUTPUT, result_settings(config), {"scene": store.digest(scene)}, overwrite, {"scene": scene})
     if folder.complete:
         return folder.reused()
     fit_radiance(config, read_scene(scene), folder, device)

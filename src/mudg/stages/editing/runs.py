@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import known_input
 
 BEST_FIRST: Final = ("mudg_s", "street_gaussians")
 """Fits that ``mudg run`` makes; where one has to speak for all, the first that is there."""
@@ -43,7 +44,7 @@ def find_run(folder: Path) -> RunParts:
     """
     folder = Path(folder)
     if (folder / "model.json").is_file():
-        return RunParts({"": folder}, None, None, False)
+        return RunParts({"": folder}, known_input(folder, "scene"), known_input(folder, "fused"), False)
     fits = {name: folder / "fit" / name for name in BEST_FIRST if (folder / "fit" / name / "model.json").is_file()}
     scene, fused = scene_of_run(folder), folder / "fuse"
     if not fits or scene is None or not (fused / "fuse.json").is_file():
@@ -56,7 +57,9 @@ def find_run(folder: Path) -> RunParts:
 
 
 def scene_of_run(folder: Path) -> Path | None:
-    """The scene that a run worked on: labelled by it, made by it, or given to it."""
+    """The scene that a run worked on: labelled by it, made by it, or given to it; or the one that a fit belongs to."""
+    if (folder / "model.json").is_file():
+        return known_input(folder, "scene")
     for name in ("annotate", "scene"):
         if (folder / name / "scene.json").is_file():
             return folder / name
@@ -86,8 +89,8 @@ def scene_at(path: Path) -> Path:
 
 
 def fused_at(path: Path) -> Path:
-    """The fused clouds at a path: itself, or those of a run; InputError otherwise."""
-    for folder in (path, path / "fuse"):
+    """The fused clouds at a path: itself, or those of a run or a fit; InputError otherwise."""
+    for folder in (path, path / "fuse", known_input(path, "fused") or path):
         if (folder / "fuse.json").is_file():
             return folder
     raise InputError("file not found", where=str(path / "fuse.json"), expected="a folder made by `mudg fuse`, or by `mudg run`")

@@ -184,7 +184,7 @@ def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Pat
     place = scene or parts.scene
     if place is None:
         raise UsageError(
-            "a fit alone does not know its log",
+            "the scene of this fit is not known, is gone or has changed",
             where=str(run),
             remedy="add --scene FOLDER, or give the folder of a run",
         )
