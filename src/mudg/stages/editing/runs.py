@@ -44,7 +44,7 @@ def find_run(folder: Path) -> RunParts:
     """
     folder = Path(folder)
     if (folder / "model.json").is_file():
-        return RunParts({"": folder}, known_input(folder, "scene"), known_input(folder, "fused"), False)
+        return RunParts({"": folder}, known_input(folder, "scene"), None, False)
     fits = {name: folder / "fit" / name for name in BEST_FIRST if (folder / "fit" / name / "model.json").is_file()}
     scene, fused = scene_of_run(folder), folder / "fuse"
     if not fits or scene is None or not (fused / "fuse.json").is_file():
