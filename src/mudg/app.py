@@ -111,9 +111,7 @@ def _require_current_folder() -> None:
         os.getcwd()
     except OSError as error:
         remedy = "change to a folder that exists"
-        raise ResourceError(
-            "the current folder is gone, or cannot be entered", got=str(error), remedy=remedy
-        ) from error
+        raise ResourceError("the current folder is gone, or cannot be entered", got=str(error), remedy=remedy) from error
 
 
 def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
@@ -152,13 +150,7 @@ def _help(verb: str, words: Sequence[str]) -> str | None:
 
     if verb in steps.groups() and {"-h", "--help", "--help-all"} & {*words}:
         return "\n".join(
-            [
-                f"usage: mudg {verb} WORD [flags]",
-                "",
-                *_listed(steps.groups()[verb]),
-                "",
-                f"mudg {verb} WORD --help lists its flags.",
-            ]
+            [f"usage: mudg {verb} WORD [flags]", "", *_listed(steps.groups()[verb]), "", f"mudg {verb} WORD --help lists its flags."]
         )
     if verb in steps.groups():
         return None
@@ -187,9 +179,7 @@ def parse(words: Sequence[str]) -> tuple[Step, Common]:
 
     verb, rest = find_verb(words)
     if verb in steps.groups():
-        raise UsageError(
-            f"mudg {verb} needs one more word", expected=", ".join(f"mudg {one}" for one in steps.groups()[verb])
-        )
+        raise UsageError(f"mudg {verb} needs one more word", expected=", ".join(f"mudg {one}" for one in steps.groups()[verb]))
     return command.parse(steps.step_class(verb), rest)
 
 
@@ -210,9 +200,7 @@ def _run_verb(verb: str, words: Sequence[str]) -> tuple[dict[str, Any], bool]:
         return placed.answer(perform(placed))
 
     with _sigterm_interrupts():
-        if any("://" in word for word in words) and not verb.startswith(
-            "batch"
-        ):  # whose workers stage in and out for every step
+        if any("://" in word for word in words) and not verb.startswith("batch"):  # whose workers stage in and out for every step
             from mudg.base import staging
 
             return staging.run_staged(verb, step, call, common.scratch), common.json

@@ -38,7 +38,7 @@ def fits_of(config: FitConfig, continued: bool = True) -> tuple[FitConfig, FitCo
 
 
 @dataclass(frozen=True)
-class Step:
+class ChainStep:
     """One step of the chain: the name in tables, the folder it fills (relative to OUT), and what does it."""
 
     name: str
@@ -93,8 +93,8 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
             ledger.timed(step)
         key = _report_key(out)
         if not ledger.has_report(key):
-            ledger.timed(Step("viewer", "viewer.html", lambda: _write_viewer(out)))
-        reels = None if ledger.has_report(key) else ledger.timed(Step("report", "report.html", lambda: run_report.film(out)))
+            ledger.timed(ChainStep("viewer", "viewer.html", lambda: _write_viewer(out)))
+        reels = None if ledger.has_report(key) else ledger.timed(ChainStep("report", "report.html", lambda: run_report.film(out)))
     except KeyboardInterrupt:
         ledger.save("interrupted")
         raise
@@ -182,13 +182,13 @@ def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Le
     else:
         of_preset = config.ingest.resolution == PRESETS["fast"]["ingest.resolution"]  # which is for logs: a city has a size of its own
         settings = replace(config.ingest, resolution="") if str(source) == CITY and of_preset else config.ingest
-        scene = ledger.timed(Step("ingest", "scene", lambda: ingest.run(settings, str(source), out / "scene", overwrite=overwrite)))
+        scene = ledger.timed(ChainStep("ingest", "scene", lambda: ingest.run(settings, str(source), out / "scene", overwrite=overwrite)))
     if not ledger.has_done("fuse"):
         log.info(_forecast(config, scene))
     if not _has_semantics(scene):
         labelled = out / "annotate"
         return ledger.timed(
-            Step("annotate", "annotate", lambda: annotate.run(config.annotate, scene, labelled, overwrite=overwrite))
+            ChainStep("annotate", "annotate", lambda: annotate.run(config.annotate, scene, labelled, overwrite=overwrite))
         )
     return scene
 
@@ -258,7 +258,7 @@ def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
     return loaded.source.recipe is not None, why_not(loaded, replace(config.adapt, cameras=config.synthesize.cameras))
 
 
-def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[Step, ...]:
+def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[ChainStep, ...]:
     from mudg.stages import adapt, fit, fuse, render, score, synthesize
 
     fused, virtual = out / "fuse", out / "synthesize"
@@ -294,15 +294,15 @@ def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[
         return score.run(config.score, scene, compared, out / "score", fused=fused, overwrite=overwrite)
 
     return (
-        Step("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
-        Step("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}",
+        ChainStep("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
+        ChainStep("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}",
              lambda: fit.run(plain, scene, fused, models[WITHOUT_DIFFUSION], overwrite=overwrite)),
-        *((Step("adapt", "adapt", adapted),) if diffusion.adapts else ()),
-        Step("synthesize", "synthesize", synthesized),
-        Step("fit with diffusion", f"fit/{WITH_DIFFUSION}", fitted_guided),
-        Step("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
-        Step("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),
-        Step("score", "score", scored),
+        *((ChainStep("adapt", "adapt", adapted),) if diffusion.adapts else ()),
+        ChainStep("synthesize", "synthesize", synthesized),
+        ChainStep("fit with diffusion", f"fit/{WITH_DIFFUSION}", fitted_guided),
+        ChainStep("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
+        ChainStep("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),
+        ChainStep("score", "score", scored),
     )  # fmt: skip
 
 
@@ -407,7 +407,7 @@ class _Ledger:
         """Whether a step has ended before."""
         return self._steps.get(step, {}).get("state") == "complete"
 
-    def timed(self, step: Step) -> Any:
+    def timed(self, step: ChainStep) -> Any:
         """Do one step and add its seconds, also when it is interrupted; a reused result adds none. The next step begins with the memory
         that this one took given back."""
         from mudg.core.raster.cpu import release_memory

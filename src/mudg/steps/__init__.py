@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from mudg.steps.step import Step, load
+from mudg.steps.step import Step
 
 _HOMES: Final[Mapping[str, str]] = {
     "demo": "mudg.steps.run:Demo",
@@ -18,9 +19,9 @@ _HOMES: Final[Mapping[str, str]] = {
     "fit": "mudg.steps.fit:Fit",
     "adapt": "mudg.steps.adapt:Adapt",
     "synthesize": "mudg.steps.synthesize:Synthesize",
-    "render": "mudg.steps.render:Render",
+    "render": "mudg.steps.render:RenderViews",
     "score": "mudg.steps.score:Score",
-    "view": "mudg.steps.view:View",
+    "view": "mudg.steps.view:ViewScene",
     "page": "mudg.steps.page:Page",
     "report": "mudg.steps.report:Report",
     "edit": "mudg.steps.edit:Edit",
@@ -28,7 +29,7 @@ _HOMES: Final[Mapping[str, str]] = {
     "asset import": "mudg.steps.asset:AssetImport",
     "export": "mudg.steps.export:Export",
     "batch run": "mudg.steps.batch:BatchRun",
-    "batch status": "mudg.steps.batch:BatchStatus",
+    "batch status": "mudg.steps.batch:BatchProgress",
     "batch retry": "mudg.steps.batch:BatchRetry",
     "bench": "mudg.steps.bench:Bench",
     "convert": "mudg.steps.convert:Convert",
@@ -39,7 +40,8 @@ VERBS: Final = tuple(_HOMES)
 
 def step_class(verb: str) -> type[Step]:
     """The step of a verb; KeyError for a name that is none."""
-    return load(_HOMES[verb])
+    module, _, name = _HOMES[verb].partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def sections() -> Iterator[tuple[str, list[str]]]:

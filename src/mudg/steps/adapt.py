@@ -22,18 +22,7 @@ class Adapt(Output):
     )
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "model"
-    short = (
-        "model",
-        "cameras",
-        "shifts_m",
-        "steps",
-        "lr",
-        "fit_iterations",
-        "precision",
-        "device",
-        "processes",
-        "seed",
-    )
+    short = ("model", "cameras", "shifts_m", "steps", "lr", "fit_iterations", "precision", "device", "processes", "seed")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None

@@ -57,13 +57,11 @@ class BatchRun(Step):
         from mudg.stages import batch
 
         settings = batch.settings_of(self.preset, self.config, self.set)
-        request = batch.BatchRequest(
-            self.list, self.out, self.settings, settings, tuple(sys.argv[1:]), self.wait, self.scratch
-        )
+        request = batch.BatchRequest(self.list, self.out, self.settings, settings, tuple(sys.argv[1:]), self.wait, self.scratch)
         return batch.run(request, self.dry_run)
 
 
-class BatchStatus(Step):
+class BatchProgress(Step):
     """Show how far a batch is."""
 
     section = "many drives"

@@ -66,9 +66,7 @@ class Bench(Output):
     def run(self) -> Path:
         from mudg.bench import run as bench
 
-        return bench.run(
-            self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite
-        )
+        return bench.run(self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite)
 
     def answer(self, outcome: Any) -> dict[str, Any]:
         from mudg.base import store

@@ -57,17 +57,12 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
     own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
     its_own = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    common = Common(
-        **{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own}
-    )
+    common = Common(**{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own})
     by_words = cls.from_words(found.words)
     for name in by_words.keys() & own.keys():
-        raise UsageError(
-            f"{flag_name(name)} was given twice", got=f"{by_words[name]!r} and {own[name]!r}", expected=usage(cls)
-        )
+        raise UsageError(f"{flag_name(name)} was given twice", got=f"{by_words[name]!r} and {own[name]!r}", expected=usage(cls))
     common = dataclasses.replace(
-        common,
-        **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)},
+        common, **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)}
     )
     settings = configuration.nested({name: _value(listed[name].kind, value) for name, value in given.items()})
     return cls.build({**by_words, **own}, settings, common.config), common
@@ -124,12 +119,9 @@ def _second_named(cls: type[Step], words: list[str]) -> list[str]:
 def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:
     flag = word.partition("=")[0]
     known = [flag_name(name) for name in listed]
-    near = nearest(flag, known, 0.6) or next(
-        (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4), None
-    )
+    near = nearest(flag, known, 0.6) or next((one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4), None)
     raise UsageError(
-        f"mudg {cls.verb()} has no flag {flag}",
-        remedy=f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all",
+        f"mudg {cls.verb()} has no flag {flag}", remedy=f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all"
     )
 
 
@@ -142,11 +134,7 @@ def _value(kind: Any, value: Any) -> Any:
         pairs = [word.partition("=") for word in value]
         for name, equals, folder in pairs:
             if not equals or not name or not folder:
-                raise UsageError(
-                    "a value is not a name and a folder",
-                    expected="NAME=FOLDER",
-                    got="=".join(filter(None, (name, folder))),
-                )
+                raise UsageError("a value is not a name and a folder", expected="NAME=FOLDER", got="=".join(filter(None, (name, folder))))
         return {name: folder for name, _, folder in pairs}
     if isinstance(value, str):
         if value == "None" and type(None) in get_args(kind):
@@ -171,11 +159,7 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
     head = f"mudg {cls.verb()}{f' {part}' if part else ''}"
     examples = [line for line in cls.examples if line.startswith(f"{head} ") or not part]
     shown = examples if everything or part else examples[:3]
-    lines = [
-        f"{cls.parts[part] if part else cls.summary()}",
-        "",
-        f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}",
-    ]
+    lines = [f"{cls.parts[part] if part else cls.summary()}", "", f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}"]
     if shown:
         lines += ["", "examples:", *(f"  {line}" for line in shown)]
     if cls.parts and not part:
@@ -191,11 +175,7 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
         hidden, settings = len(settings) - len(chosen), chosen
     names = {one.name for one in own}
     common = [one for one in common_options() if one.name not in names]
-    for title, rows in (
-        ("inputs and outputs:", own),
-        ("settings:", settings),
-        ("every command:", common if everything else []),
-    ):
+    for title, rows in (("inputs and outputs:", own), ("settings:", settings), ("every command:", common if everything else [])):
         if rows:
             lines += ["", title, *(line for one in rows for line in _row(cls, one, everything))]
     if not everything:

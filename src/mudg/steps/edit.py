@@ -36,12 +36,4 @@ class Edit(Output):
     def run(self) -> Path:
         from mudg.stages import edit
 
-        return edit.run(
-            self.settings,
-            self.source,
-            self.script,
-            self.out,
-            scene=self.scene,
-            fused=self.fused,
-            overwrite=self.overwrite,
-        )
+        return edit.run(self.settings, self.source, self.script, self.out, scene=self.scene, fused=self.fused, overwrite=self.overwrite)

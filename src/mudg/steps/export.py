@@ -40,12 +40,4 @@ class Export(Step):
     def run(self) -> Path:
         from mudg.stages.exporting import export
 
-        return export.run(
-            self.settings,
-            self.format,
-            self.source,
-            self.out,
-            scene=self.scene,
-            edits=self.edits,
-            overwrite=self.overwrite,
-        )
+        return export.run(self.settings, self.format, self.source, self.out, scene=self.scene, edits=self.edits, overwrite=self.overwrite)

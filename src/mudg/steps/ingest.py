@@ -30,17 +30,7 @@ class Ingest(Listed):
     )  # fmt: skip
     smaller = "smaller images (--resolution; of a city --city.width), fewer --frames, one image at a time (--workers 1)"
     result = "scene"
-    short = (
-        "resolution",
-        "frames",
-        "cameras",
-        "sequence",
-        "test_every",
-        "city.seed",
-        "city.n_frames",
-        "city.width",
-        "city.height",
-    )
+    short = ("resolution", "frames", "cameras", "sequence", "test_every", "city.seed", "city.n_frames", "city.width", "city.height")
     parts = {"city": "Generate a city: a scene with exact truth."} | {
         name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
     }

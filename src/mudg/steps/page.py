@@ -35,6 +35,4 @@ class Page(Step):
     def run(self) -> dict[str, Any]:
         from mudg.stages.viewing import view
 
-        return view.run_page(
-            self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite
-        )
+        return view.run_page(self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite)

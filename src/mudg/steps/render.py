@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mudg.stages.config import RenderConfig
 
 
-class Render(Output):
+class RenderViews(Output):
     """Render RGB, depth and semantics of a fitted scene on shifted trajectories."""
 
     section = "single steps, in the order of use"
@@ -22,18 +22,7 @@ class Render(Output):
     )
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
-    short = (
-        "cameras",
-        "shifts_m",
-        "paths",
-        "width_px",
-        "video",
-        "fps",
-        "remove_tracks",
-        "device",
-        "harmonize.on",
-        "harmonize.model",
-    )
+    short = ("cameras", "shifts_m", "paths", "width_px", "video", "fps", "remove_tracks", "device", "harmonize.on", "harmonize.model")
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None
@@ -44,6 +33,10 @@ class Render(Output):
     """Point clouds written by fuse; for --harmonize.on."""
     settings: RenderConfig
 
+    @classmethod
+    def verb(cls) -> str:
+        return "render"
+
     def required(self) -> tuple[str, ...]:
         return ("model",)
 
@@ -51,11 +44,5 @@ class Render(Output):
         from mudg.stages import render
 
         return render.run(
-            self.settings,
-            self.scene,
-            cast("Path", self.model),
-            self.out,
-            edits=self.edits,
-            fused=self.fused,
-            overwrite=self.overwrite,
+            self.settings, self.scene, cast("Path", self.model), self.out, edits=self.edits, fused=self.fused, overwrite=self.overwrite
         )

@@ -19,10 +19,7 @@ class Run(Output):
     """Run all steps on your own driving log or scene and write a report page."""
 
     section = "start here"
-    examples = (
-        "mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti",
-        "mudg run scenes/a --out runs/a --preset quality",
-    )
+    examples = ("mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti", "mudg run scenes/a --out runs/a --preset quality")
     short = ("device", "adaptation", "continue_fit")
     source: Annotated[str, Flag("SOURCE", "first")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""

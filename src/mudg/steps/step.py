@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
-import importlib
 import inspect
 import sys
 import typing
@@ -97,10 +96,7 @@ class Step:
                 values[name] = left.pop(0)
         if left:
             raise UsageError(
-                "too many words",
-                expected=usage(cls),
-                got=" ".join(map(repr, left)),
-                remedy="a value needs its flag before it",
+                "too many words", expected=usage(cls), got=" ".join(map(repr, left)), remedy="a value needs its flag before it"
             )
         return values
 
@@ -122,9 +118,7 @@ class Step:
         return True
 
     @classmethod
-    def build(
-        cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None
-    ) -> Self:
+    def build(cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None) -> Self:
         """The step of plain values, as they come from a command line or a caller.
 
         Args:
@@ -149,11 +143,7 @@ class Step:
                 raise refused(cls, name, error) from error
         missing = [name for name, field in known.items() if name not in checked and field.default is MISSING]
         if missing:
-            raise UsageError(
-                f"no {shown_name(cls, missing[0])} was given",
-                expected=usage(cls),
-                remedy=f"see mudg {cls.verb()} --help",
-            )
+            raise UsageError(f"no {shown_name(cls, missing[0])} was given", expected=usage(cls), remedy=f"see mudg {cls.verb()} --help")
         if cls.settings_type() is not None:
             defaults = {name: field.default for name, field in known.items()} | checked
             checked["settings"] = cls.settings_from(defaults, file, settings or {})
@@ -206,21 +196,13 @@ def hints(cls: type[Any]) -> dict[str, Any]:
 def hint_of(cls: type[Any], name: str) -> Any:
     """Type of a field, without its `Flag`."""
     kind = hints(cls)[name]
-    return (
-        get_args(kind)[0]
-        if get_origin(kind) is Annotated and any(isinstance(item, Flag) for item in get_args(kind)[1:])
-        else kind
-    )
+    return get_args(kind)[0] if get_origin(kind) is Annotated and any(isinstance(item, Flag) for item in get_args(kind)[1:]) else kind
 
 
 def flag_of(cls: type[Any], name: str) -> Flag:
     """What the command line knows of a field."""
     kind = hints(cls)[name]
-    return (
-        next((item for item in get_args(kind)[1:] if isinstance(item, Flag)), Flag(""))
-        if get_origin(kind) is Annotated
-        else Flag("")
-    )
+    return next((item for item in get_args(kind)[1:] if isinstance(item, Flag)), Flag("")) if get_origin(kind) is Annotated else Flag("")
 
 
 def field_of(cls: type[Any], name: str) -> Any:
@@ -268,11 +250,7 @@ def in_reading_order(cls: type[Any]) -> list[dataclasses.Field[Any]]:
     def rank(field: dataclasses.Field[Any]) -> int:
         if flag_of(cls, field.name).position in ("first", "rest"):
             return 0
-        return (
-            1
-            + (flag_of(cls, field.name).position != "second")
-            + (field.default is not MISSING or field.name == "overwrite")
-        )
+        return 1 + (flag_of(cls, field.name).position != "second") + (field.default is not MISSING or field.name == "overwrite")
 
     return sorted(own, key=rank)
 
@@ -323,9 +301,7 @@ def _setting_options(kind: Any, values: Any, path: str) -> Iterator[Option]:
             yield from _setting_options(type(value), value, f"{name}.")
         else:
             kind = types[field.name]
-            kind = (
-                get_args(kind)[0] if get_origin(kind) is Annotated else kind
-            )  # constraints do not matter to the command line
+            kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind  # constraints do not matter to the command line
             yield Option(name, kind, value, texts.get(field.name, ""), False)
 
 
@@ -334,9 +310,7 @@ def texts_of(kind: type[Any]) -> dict[str, str]:
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if base.__dict__.get("__annotations__"):
-            texts |= _texts_of_module(getattr(sys.modules[base.__module__], "__file__", None) or "").get(
-                base.__qualname__, {}
-            )
+            texts |= _texts_of_module(getattr(sys.modules[base.__module__], "__file__", None) or "").get(base.__qualname__, {})
     return texts
 
 
@@ -373,15 +347,11 @@ def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
 
     def call(*args: Any, config: str | Path | None = None, **given: Any) -> Any:
         names = [
-            parameter.name
-            for parameter in inspect.signature(call).parameters.values()
-            if parameter.kind != inspect.Parameter.KEYWORD_ONLY
+            parameter.name for parameter in inspect.signature(call).parameters.values() if parameter.kind != inspect.Parameter.KEYWORD_ONLY
         ]
         if len(args) > len(names):
             raise UsageError(
-                f"mudg.{name} takes {len(names)} arguments without a name",
-                expected=", ".join(names),
-                got=f"{len(args)} of them",
+                f"mudg.{name} takes {len(names)} arguments without a name", expected=", ".join(names), got=f"{len(args)} of them"
             )
         values = dict(zip(names, args, strict=False))
         twice = sorted(values.keys() & given.keys())
@@ -452,9 +422,3 @@ def documentation(cls: type[Step]) -> str:
         text = texts.get(name) or ("YAML file of settings, read before those given here." if name == "config" else "")
         lines.append(f"    {name}: {text}".rstrip())
     return "\n".join(lines)
-
-
-def load(home: str) -> type[Step]:
-    """The class behind ``module:Class``."""
-    module, _, name = home.partition(":")
-    return getattr(importlib.import_module(module), name)

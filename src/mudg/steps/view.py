@@ -11,15 +11,11 @@ if TYPE_CHECKING:
     from mudg.stages.config import ViewConfig
 
 
-class View(Step):
+class ViewScene(Step):
     """Show a fitted scene in a browser, with exact frames from the rasterizer."""
 
     section = "look at a drive"
-    examples = (
-        "mudg view runs/kitti",
-        "mudg view runs/a runs/b",
-        "mudg view runs/mudg_s --scene scenes/city --port 8080",
-    )
+    examples = ("mudg view runs/kitti", "mudg view runs/a runs/b", "mudg view runs/mudg_s --scene scenes/city --port 8080")
     source: Annotated[Path, RUN]
     """Folder of a finished mudg run, or Gaussian scene written by fit."""
     compare: Annotated[Path | None, Flag("[RUN2]", "first")] = None
@@ -33,6 +29,10 @@ class View(Step):
     overwrite: bool = False
     """Save edits over a file that mudg view did not write."""
     settings: ViewConfig
+
+    @classmethod
+    def verb(cls) -> str:
+        return "view"
 
     def run(self) -> dict[str, Any]:
         from mudg.stages.viewing import edits, view
