@@ -114,7 +114,8 @@ def test_a_fit_knows_its_scene_until_that_changes(notebook: dict[str, Any], tmp_
         shutil.copytree(notebook["folder"] / name, tmp_path / "a" / name)
     (tmp_path / "a").rename(tmp_path / "b")  # what lies beside each other may move together
     folder = tmp_path / "b"
-    assert [frame.id for frame in mudg.read_scene(folder / "fit").frames] == [frame.id for frame in mudg.read_scene(folder / "scene").frames]
+    by_fit, by_path = (mudg.read_scene(folder / name) for name in ("fit", "scene"))
+    assert [frame.id for frame in by_fit.frames] == [frame.id for frame in by_path.frames]
     views = mudg.render(folder / "fit", out=tmp_path / "views", cameras=("front",), shifts_m=(0.0,), video=False)
     assert store.read_json(views / "run.json")["inputs"].keys() == {"scene", "model"}
     assert mudg.page(folder / "fit", out=tmp_path / "fit.html").is_file()

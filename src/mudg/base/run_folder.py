@@ -185,7 +185,7 @@ def run_state(folder: Path) -> dict[str, Any]:
 
 
 def known_input(folder: Path, name: str) -> Path | None:
-    """Where an input of a finished result lies, as seen from the result or from the root; None if it is not known, is gone or has changed."""
+    """Where an input of a finished result lies, as seen from the result or from the root; None if unknown, gone or changed."""
     try:
         state = store.read_json(folder / _STATE)
         places, digest = state["paths"][name], state["inputs"][name]
