@@ -228,27 +228,6 @@ class LearnCompute:
 class LearnConfig:
     """Train a multi-modal diffusion model on generated cities or on recorded logs."""
 
-    MOVED: ClassVar[dict[str, str | None]] = {
-        **{name: f"data.{name}" for name in (
-            "width", "height", "window", "clips", "augment", "reference_dropout", "cities", "first_cities", "all_cities_at",
-            "clips_per_city", "held_out", "scenes", "stride", "frame_step", "held_out_every", "label_confidence",
-        )},
-        **{name: f"network.{name}" for name in (
-            "widths", "blocks", "spatial_attention", "temporal_attention", "patch", "refine_widths", "refine_blocks",
-        )},
-        **{name: f"optimizer.{name}" for name in (
-            "batch_frames", "full_window_share", "lr", "warmup_steps", "decay_share", "last_lr_share", "weight_decay", "clip_norm",
-            "average_decay",
-        )},
-        **{name: f"compute.{name}" for name in (
-            "device", "parallel", "accumulate", "recompute", "workers", "checkpoint_every", "log_every", "tensorboard",
-        )},
-        "scene_cameras": "data.cameras", "codec_steps": "codec.steps", "codec_batch": "codec.batch",
-        "codec_fit_batches": "codec.fit_batches", "codec_lr": None, "beta1": "optimizer.betas", "beta2": "optimizer.betas",
-        "balance": "loss.class_balance", "refined_share": "loss.refined_share", "sample_every": "score.every",
-        "watched": "score.watched", "sample_steps": "score.steps", "score_steps": "score.steps", "cache_latents": None,
-    }  # fmt: skip
-
     seed: int = 0
     """Seed of the cities, the initial weights and all other random numbers."""
     start: str = ""
