@@ -284,14 +284,14 @@ def _halved_share(config: RunConfig, size: SceneSize) -> float:
 
 def _lessons(config: RunConfig) -> int:
     """Short fits that adapt makes: two with gaps, one per lateral shift and per camera left out."""
-    return 2 * config.adapt.gaps + len(config.adapt.shifts_m) + len(config.adapt.cameras_left_out)
+    return 2 * config.adapt.gaps + len(config.adapt.shifts_m)
 
 
 def _adapting(config: RunConfig, size: SceneSize) -> float:
     """Core-seconds of adapt: every lesson is fitted, its clips are made, the model is trained, and scored before and after."""
     adapt = config.adapt
     fitted = FIT_START_S + LESSON_S + PROCESS_S + adapt.fit_iterations * GAUSSIAN_STEP_S * SHORT_GAUSSIANS
-    clips = size.path_images * (1 * adapt.gaps + len(adapt.shifts_m) + len(adapt.cameras_left_out))
+    clips = size.path_images * (1 * adapt.gaps + len(adapt.shifts_m))
     made = clips * (CLIP_STEP_S + CLIP_S + FULL_VIEW_S * size.pixels)
     return _lessons(config) * fitted + made + adapt.steps * adapt.batch_frames * TRAINED_FRAME_S
 
