@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import io
-import json
 import shutil
 import sqlite3
 import zipfile
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import bad_logs
-import kitti_folders
 import numpy as np
 import pytest
 import write_av2
@@ -24,7 +22,6 @@ import write_dgp
 import write_nuscenes
 import write_waymo
 from bad_logs import NEEDS_PYARROW, Change
-from PIL import Image
 from roundtrip import needs_native
 
 from mudg.data.importers.options import ImportOptions
@@ -218,36 +215,11 @@ def dgp(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path
     return lambda root: write_dgp.edit(root / file, lambda record: [change(record), None][1])
 
 
-def kitti_frame(root: Path, name: str = "000008.png", label_number: int = 2) -> None:
-    """A KITTI frame described by info.json."""
-    Image.fromarray(kitti_folders.image(1)).save(root / "000008.png")
-    np.array([[10.0, 0, 0, 0.5]], "<f4").tofile(root / "000008.bin")
-    box = {"bbox_3d": [0, 1.6, 10, 4, 1.5, 1.8, 0], "bbox_label_3d": label_number, "bbox": [1, 2, 3, 4]}
-    images = {"CAM2": {"img_path": name, "cam2img": kitti_folders.projection(2).tolist(),
-                       "lidar2cam": kitti_folders.RECT0_FROM_VELO.tolist()}}  # fmt: skip
-    sample = {"images": images, "lidar_points": {"lidar_path": "000008.bin"}, "instances": [box]}
-    (root / "info.json").write_text(json.dumps({"data_list": [sample]}))
-
-
-def only(spoil: Callable[[Path], None]) -> Callable[[Path], None]:
-    """A folder made anew instead of a damaged copy."""
-
-    def fresh(root: Path) -> None:
-        shutil.rmtree(root)
-        root.mkdir()
-        spoil(root)
-
-    return fresh
-
-
 RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     # format and what is wrong: (how the log is damaged, words of the error, the place it names)
     ("kitti", "times in milliseconds"): (times(1000), "another unit", "drive|kitti"),
     ("kitti", "times in microseconds"): (times(1e6), "another unit", "kitti"),
     ("kitti", "width and length swapped"): (label(swap_label), "swapped", "label_02.txt"),
-    ("kitti", "Windows path"): (only(lambda r: kitti_frame(r, "images\\000008.png")), "backslash", "info.json: img_path"),
-    ("kitti", "class that does not exist"): (
-        only(lambda r: kitti_frame(r, label_number=11)), "class that does not exist", r"instances\[0\]"),
     ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
     ("nuplan", "Windows path"): (
         nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "backslash", "image at"),

@@ -99,12 +99,12 @@ def test_a_copied_folder_is_an_input_with_and_without_its_record(finished: Path,
     assert store.digest(copy) == store.digest(finished)
 
 
-def test_records_of_an_earlier_version_are_taken(finished: Path) -> None:
+@pytest.mark.parametrize("lost", [("check",), ("check", "sealed")])
+def test_a_record_without_its_seal_is_damaged_whatever_schema_it_names(finished: Path, lost: tuple[str, ...]) -> None:
     state = store.read_json(finished / "run.json")
-    old = {name: value for name, value in state.items() if name not in ("check", "sealed")} | {"schema": 1}
-    store.write_json(finished / "run.json", old)
-    assert store.digest(finished)
-    assert run(finished).complete
+    store.write_json(finished / "run.json", {name: value for name, value in state.items() if name not in lost} | {"schema": 1})
+    with pytest.raises(IntegrityError, match="record of a run is damaged"):
+        store.digest(finished)
 
 
 # ---- outputs that cannot be --------------------------------------------------------------------------------------------

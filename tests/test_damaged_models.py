@@ -116,7 +116,7 @@ def copied(source: Path, folder: Path) -> Path:
 
 
 def read_all_of(folder: Path) -> None:
-    for read in (mdm_files.facts, mdm_files.uses_renders, mdm_files.takes_effects, published_files.is_published):
+    for read in (mdm_files.facts, mdm_files.uses_renders, published_files.is_published):
         ends_in_words(lambda read=read: read(folder))
 
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
+from scipy.spatial import cKDTree
 from toy_world import CAR_SIZE, car_pose, ego_pose, fused_cloud, write_scene
 
 import mudg
 from mudg import app
-from mudg.base import geometry, store
+from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Scene
@@ -127,6 +128,28 @@ def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
     again = edit.run(EditConfig(), out, script(tmp_path, "- remove: {ids: [car]}", "more.yaml"), tmp_path / "twice")
     assert read_scene(again / "scene").tracks == ()
     assert read_fused(again / "fuse").objects == {}
+
+
+def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(run: Path, tmp_path: Path, capsys) -> None:
+    """Fog takes returns of far surfaces and adds some of its own, nearer than what stands there, on beams of the recording."""
+    log.set_quiet(False)
+    out = edit.run(EditConfig(), run, script(tmp_path, "- weather: {fog: {visibility_m: 12}}"), tmp_path / "foggy")
+    assert "LiDAR sweeps are in fog and rain" in capsys.readouterr().err
+    old, new = read_scene(run / "scene"), read_scene(out / "scene")
+    for a, b in zip(old.frames, new.frames, strict=True):
+        assert np.array_equal(read_image(old, a), read_image(new, b))
+    clear, foggy = (sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps) for scene in (old, new))
+    became = store.read_json(out / "lidar.json")
+    assert became.get("lost", 0) == clear - foggy
+    droplets = 0
+    for a, b in zip(old.sweeps, new.sweeps, strict=True):
+        before, after = read_points(old, a), read_points(new, b)
+        ranges = [np.linalg.norm(points.xyz, axis=1) for points in (before, after)]
+        recorded, kept = (points.xyz / r[:, None] for points, r in zip((before, after), ranges, strict=True))
+        beam = cKDTree(recorded).query(kept)[1]
+        droplets += int((ranges[1] < ranges[0][beam] - 1e-3).sum())
+        assert np.abs(kept - recorded[beam]).max() < 1e-4 and (ranges[1] < ranges[0][beam] + 1e-3).all()
+    assert 0 < became["droplets"] == pytest.approx(droplets, abs=2)
 
 
 def test_the_vehicle_of_a_run_changes_lanes(run: Path, tmp_path: Path) -> None:

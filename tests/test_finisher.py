@@ -263,7 +263,7 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
     ramp = torch.stack(torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"))
     of_clips = torch.stack([torch.cat([ramp, torch.full((1, height, width), float(n))]) for n in range(2)]).repeat_interleave(frames, 0)
 
-    def refined(latents, pixels, frames, effects):
+    def refined(latents, pixels, frames):
         assert torch.equal(latents["rgb"][:, :3], functional.avg_pool2d(pixels.color, 2))  # latents and condition are of one place
         one = pixels.color[:, :1]
         return Refined(pixels.color, one, functional.one_hot(one[:, 0].long() * 0, 19).permute(0, 3, 1, 2), one)

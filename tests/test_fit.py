@@ -17,7 +17,6 @@ from fit_settings import fit_config
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg import native
-from mudg.base import config as configuration
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.palette import ID
@@ -318,16 +317,6 @@ def test_another_configuration_in_the_same_folder_is_refused(world, tmp_path):
     assert fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit") == tmp_path / "fit"
     with pytest.raises(UsageError, match="another configuration"):
         fit.run(settings(iterations=3), world["scene"], world["fuse"], tmp_path / "fit")
-
-
-def test_settings_of_older_files_are_refused_with_their_new_place(tmp_path):
-    for old, new in FitConfig.MOVED.items():
-        (tmp_path / "run.yaml").write_text(f"verb: fit\n{old}: 1\n")
-        with pytest.raises(UsageError, match=f"key {old} " + ("was removed" if new is None else f"is now called {new}$|{new}\n")):
-            configuration.load(FitConfig, None, tmp_path / "run.yaml")
-        place = FitConfig()
-        for part in [] if new is None else new.split("."):
-            place = getattr(place, part)
 
 
 def test_unknown_camera_and_no_fit(world, tmp_path):

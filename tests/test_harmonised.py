@@ -308,60 +308,17 @@ def test_renders_are_repaired_where_the_edit_touches_them(run: Path, tmp_path: P
     assert changed > 0
 
 
-def with_effects(run: Path) -> str:
-    """The tiny diffusion model with effects that are not zero."""
-    folder = run / "model_of_effects"
-    if not folder.is_dir():
-        torch.manual_seed(1)
-        model = MDM(replace(SMALL, effects=4))
-        with torch.no_grad():
-            for name, value in model.named_parameters():
-                if name.startswith("effects."):
-                    value.normal_(0, 0.5)
-        files.save(model, folder, "", {})
-    return str(folder)
-
-
-def test_weather_is_corrected_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
+def test_weather_is_that_of_the_formulas_with_another_model(run: Path, tmp_path: Path, capsys) -> None:
     log.set_quiet(False)  # a command before may have been asked to be
     edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
     plain = RenderConfig(shifts_m=(0.0,), video=False)
-
-    def rendered(name: str, model: str, strength: float, any_model: bool = False) -> list[Observation]:
-        harmonize = HarmonizeConfig(on=True, model=model, steps=2, weather=strength, weather_any_model=any_model)
-        config = replace(plain, harmonize=harmonize) if model else plain
-        return views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse"))
-
-    physical, kept = rendered("physical", "", 0.0), rendered("kept", with_effects(run), 0.0)
-    assert "--harmonize.weather is 0" in capsys.readouterr().err
-    unknown = rendered("unknown", str(run / "model"), 1.0)
-    assert "--harmonize.weather-any-model" in capsys.readouterr().err
-    untold = rendered("untold", str(run / "model"), 1.0, any_model=True)
-    assert "without knowing" in capsys.readouterr().err
-    made = rendered("made", with_effects(run), 1.0)
-    assert len(made) == FRAMES
-    for before, one, two, three, new in zip(physical, kept, unknown, untold, made, strict=True):
-        assert torch.equal(one.rgb, before.rgb)
-        assert torch.equal(two.rgb, before.rgb)
-        for corrected_view in (three, new):
-            assert float((corrected_view.rgb - before.rgb).abs().mean()) > 0.01
-            assert torch.equal(corrected_view.semantics, before.semantics)
-
-
-@pytest.mark.slow
-def test_views_are_generated_in_weather_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
-    edits, folders = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse")
-    config = SynthesizeConfig(shifts_m=(0.0,), model=with_effects(run), steps=1, full_size=False, processes=1, precision="float32")
-    fitted = run / "fit" / "street_gaussians"
-    day = views_of(synthesize.run(config, *folders, tmp_path / "day", fitted=fitted))
-    night = views_of(synthesize.run(config, *folders, tmp_path / "night", fitted=fitted, edits=edits))
-    assert "show no weather" not in capsys.readouterr().err
-    assert not any(torch.equal(a.rgb, b.rgb) for a, b in zip(day, night, strict=True))
-    other = replace(config, model=str(run / "model"))
-    by_day = views_of(synthesize.run(other, *folders, tmp_path / "other_day", fitted=fitted))
-    still = views_of(synthesize.run(other, *folders, tmp_path / "other_night", fitted=fitted, edits=edits))
-    assert "show no weather" in capsys.readouterr().err
-    assert all(torch.equal(a.rgb, b.rgb) for a, b in zip(by_day, still, strict=True))
+    asked = replace(plain, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, weather=1.0))
+    physical, kept = (
+        views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse"))
+        for name, config in (("physical", plain), ("asked", asked))
+    )
+    assert "no published-type model" in capsys.readouterr().err
+    assert all(torch.equal(one.rgb, before.rgb) for before, one in zip(physical, kept, strict=True))
 
 
 def test_a_correction_keeps_the_detail_of_the_render() -> None:
@@ -457,7 +414,7 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
     clear = conditions_of(replace(sources, weather=None), "full", views, {})[0]
     made = conditions_of(sources, "full", views, {})[0]
     assert torch.equal(made.depth, clear.depth)
-    assert made.effect is None and float(clear.color.max()) == 0 == float(clear.reference.max())
+    assert float(clear.color.max()) == 0 == float(clear.reference.max())
     colored = made.color[0].amax(0) > 0
     assert 0.2 < float(colored.float().mean()) <= float(made.valid.float().mean())
     far = how.image(views[0], torch.zeros(3, 32, 48), torch.full((1, 32, 48), 2000.0), ids)
@@ -482,7 +439,7 @@ def test_weather_is_generated_by_a_published_type_model(run: Path, published: st
 
     before, given = rendered("physical"), watched(monkeypatch)
     made = rendered("made", on=True)
-    assert "no effect vector" not in capsys.readouterr().err
+    assert "formulas alone" not in capsys.readouterr().err
     for path, frames in made.items():
         for number, (one, new) in enumerate(zip(before[path], frames, strict=True)):
             assert torch.equal(one.rgb, new.rgb) == (path != "front_recorded" and number == 0)

@@ -151,22 +151,6 @@ def test_the_recipes_of_the_shipped_models_are_settings_files(name, tmp_path):
     assert network.widths == files.load(name).config.widths
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [({"lr": 1e-4}, "optimizer.lr"), ({"cities": 3}, "data.cities"), ({"cache_latents": True}, "removed")],
-)
-def test_settings_by_their_old_names_are_refused_with_the_new_ones(old, new, tmp_path):
-    (tmp_path / "old.yaml").write_text(yaml.safe_dump(old))
-    with pytest.raises(UsageError, match=new):
-        load(LearnConfig, None, tmp_path / "old.yaml")
-
-
-def test_old_names_lead_to_settings_that_exist():
-    for new in filter(None, LearnConfig.MOVED.values()):
-        group, name = new.split(".")
-        assert hasattr(getattr(LearnConfig(), group), name), new
-
-
 def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "training.md").read_text()
     (tmp_path / "stage1.yaml").write_text(text.partition("`stage1.yaml`:")[2].split("```yaml\n")[1].split("```")[0])

@@ -269,7 +269,7 @@ def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
     sources = [LogSource(street / "scene", street / "fuse")]
     rules = LogClipRules(width=48, height=32, window=4)
     from_log.claim_folder(tmp_path, rules, sources)
-    assert "published" not in json.loads((tmp_path / from_log.INDEX).read_text())["rules"]  # as in earlier versions
+    assert "published" not in json.loads((tmp_path / from_log.INDEX).read_text())["rules"]
     with pytest.raises(UsageError, match="other logs or settings"):
         from_log.claim_folder(tmp_path, replace(rules, published=True), sources)
 

@@ -193,7 +193,6 @@ def test_colour_bands():
     scene = model(degree=2)
     both = torch.cat([scene.table["sh_dc"], scene.table["sh_rest"]], 1)
     assert torch.equal(harmonics(compose(scene, 0.3))[:5], both[:5])  # those of objects turn with them
-    assert torch.equal(harmonics(compose(replace(scene, harmonics_in_world=True), 0.3)), both)
     lowest = compose(model(), 0.3)
     assert lowest.sh.shape == (12, 1, 3)
     assert lowest.sh_rest is None
@@ -509,15 +508,6 @@ def test_pose_matrix_is_the_learnt_pose():
     assert node.pose_matrix(2.5) is None
 
 
-def test_offsets_of_the_former_single_column_are_read():
-    facts, tensors = RigidNode.from_track(track()).state()
-    old = {key: value for key, value in tensors.items() if not key.startswith("offsets.")}
-    old["offsets.column.offsets"] = torch.arange(16.0).view(4, 4)
-    read = RigidNode.from_state(facts, old)
-    assert torch.equal(read.offsets["shift"], old["offsets.column.offsets"][:, :3])
-    assert torch.equal(read.offsets["yaw"], old["offsets.column.offsets"][:, 3])
-
-
 # ---- deformable ------------------------------------------------------------------------------------------------------
 
 
@@ -653,26 +643,21 @@ def test_an_object_and_a_camera_that_turn_together_show_the_same_picture(backend
     made["sh_rest"] *= 0.3
     extra = {"curve": torch.zeros(40, 4, 3)} if kind is BezierNode else {}
 
-    def picture(place: np.ndarray, world_axes: bool = False) -> torch.Tensor:
+    def picture(place: np.ndarray) -> torch.Tensor:
         still = kind("car", "car", (4, 2, 1.5), np.array([0.0, 1.0]), np.stack([place, place]))
         table = Table({**made, **extra}, {"node": torch.ones(40, dtype=torch.int32)})
-        scene = SceneModel(table, (StaticNode(), still), None, (0, 10, 13), 3, {}, harmonics_in_world=world_axes)
+        scene = SceneModel(table, (StaticNode(), still), None, (0, 10, 13), 3, {})
         camera = Camera("front", 32, 24, 30.0, 30.0, 16.0, 12.0)
         behind = geometry.from_rotation_translation(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (-6, 0, 0.5))
         return rasterize(compose(scene, 0.4), View(camera, place @ behind, 0.4), RasterConfig(backend=backend)).rgb.detach()
 
     here, there = np.eye(4), pose(3, -2, 1, 2.1, 0.3)
     assert (picture(here) - picture(there)).abs().max() < 2e-4
-    assert (picture(here, True) - picture(there, True)).abs().max() > 0.05  # as older scenes show them
 
 
 def test_scenes_say_in_which_frame_their_harmonics_are() -> None:
     values, groups = model(degree=2).state()
     assert values["harmonics"] == "node" and "harmonics" not in model().state()[0]
-    older = SceneModel.from_state({name: value for name, value in values.items() if name != "harmonics"}, groups)
-    assert older.harmonics_in_world and older.state()[0]["harmonics"] == "world"
-    rest = compose(older, 0.3).sh_rest
-    assert rest is not None and torch.equal(rest, older.table["sh_rest"])  # drawn as it was fitted
-    assert not SceneModel.from_state(values, groups).harmonics_in_world
-    with pytest.raises(InputError, match="frame of a scene's"):
-        SceneModel.from_state({**values, "harmonics": "moon"}, groups)
+    for other in ({}, {"harmonics": "world"}):
+        with pytest.raises(InputError, match="not in the frames of its objects"):
+            SceneModel.from_state({**{name: value for name, value in values.items() if name != "harmonics"}, **other}, groups)

@@ -26,7 +26,7 @@ from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggreg
 from mudg.models.radiance.march import Budget, RayDraws, Rays
 from mudg.stages import fit, render, synthesize
 from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
-from mudg.stages.config.radiance import PUBLISHED_EMERNERF, RadianceConfig
+from mudg.stages.config.radiance import RadianceConfig
 from mudg.stages.radiance import loop
 from mudg.stages.radiance.pictures import flow_colors
 from mudg.stages.radiance.rays import extent_of, lidar_rays, view_rays
@@ -323,8 +323,10 @@ def load_field_of_gaussians(folder: Path) -> None:
     load_field(folder)
 
 
-def test_published_sizes_are_settings_of_the_same_code():
-    config = configuration.load(FitConfig, overrides=configuration.nested(dict(PUBLISHED_EMERNERF)))
+def test_published_sizes_are_settings_of_the_same_code(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "baselines.md").read_text(encoding="utf-8")
+    (tmp_path / "emernerf.yaml").write_text(page.partition("--config emernerf.yaml")[2].split("```yaml\n")[1].split("```")[0])
+    config = configuration.load(FitConfig, None, tmp_path / "emernerf.yaml")
     assert config.iterations == 25_000 and config.radiance.static_grid == (10, 4, 16, 8192, 20)
     assert isinstance(loop.sizes_of(config.radiance), FieldSizes)
 

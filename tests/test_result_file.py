@@ -142,7 +142,7 @@ def test_files_without_a_description_and_altered_ones(name: str, toy: Path, tmp_
     about = out.with_name(f"{out.name}.json")
     assert command(name, toy, tmp_path)() == 0
     whole = folder_of(tmp_path)
-    about.unlink()  # an earlier version, stopped between the two
+    about.unlink()  # stopped between the two
     assert command(name, toy, tmp_path)() == 0 and folder_of(tmp_path) == whole
     out.write_bytes(whole[out.name][:-1] + b"?")
     assert command(name, toy, tmp_path)() == 4 and "altered" in capsys.readouterr().err

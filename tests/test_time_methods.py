@@ -17,7 +17,7 @@ from pretend_device import pretend_device
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
 from mudg.core import losses, metrics
@@ -286,8 +286,6 @@ def test_features_of_a_short_run_begin_near_one_and_the_factor_is_kept():
     assert float(short.features(places).detach().mean()) == pytest.approx(1.0, abs=0.3)
     facts, tensors = short.state()
     assert torch.equal(HexPlaneNode.from_state(facts, tensors).features(places), short.features(places))
-    with pytest.raises(InputError, match="earlier version"):
-        HexPlaneNode.from_state({name: value for name, value in facts.items() if name != "gain"}, tensors)
 
 
 def test_what_is_far_from_the_frustum_is_not_asked():

@@ -197,7 +197,7 @@ def test_later_parts_add_up_and_the_peak_is_the_highest() -> None:
     assert Usage(1.0, 2.0, 30).then(Usage(4.0, 5.0, 20)) == Usage(5.0, 7.0, 30)
     assert Usage(1.0, 2.0, None).then(Usage(1.0, 1.0, 7)).peak_bytes == 7
     assert Usage.of_record(Usage(1.5, 2.5, 9).record()) == Usage(1.5, 2.5, 9)
-    assert Usage.of_record({"seconds": 3}) == Usage(3.0, 0.0, None)  # as earlier versions wrote it
+    assert Usage.of_record({"seconds": 3}) == Usage(3.0, 0.0, None)
 
 
 def test_a_run_folder_notes_what_it_took_over_all_its_runs(tmp_path: Path) -> None:

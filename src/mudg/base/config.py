@@ -1,15 +1,15 @@
 """Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name.
 
-A configuration class may say what became of keys that older files use: the class variable ``MOVED`` maps an old key to its new
-dotted one, or to None if it was removed. Such keys are refused with that name; a group's own name may stand there too, for files in
-which it was still a plain value.
+Settings that were taken out are listed in their class: the class variable ``RETIRED`` maps each name to the setting before which it
+stood ("" = last) and to the only value that results may have been made with. That value still stands in ``to_dict``, so a result's key
+stays what it was, and files may hold it. Any other value is refused.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,8 +28,30 @@ default that is itself a configuration is therefore a ``default_factory``."""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """A configuration as plain JSON values."""
-    return TypeAdapter(type(config)).dump_python(config, mode="json")
+    """A configuration as plain JSON values, in the order of its settings, those of ``RETIRED`` included."""
+    return _with_retired(config, TypeAdapter(type(config)).dump_python(config, mode="json"))
+
+
+def _with_retired(config: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    retired, whole = getattr(config, "RETIRED", {}), dict[str, Any]()
+    for name, value in values.items():
+        whole |= {old: former for old, (follower, former) in retired.items() if follower == name}
+        part = getattr(config, name)
+        whole[name] = _with_retired(part, value) if dataclasses.is_dataclass(part) else value
+    return whole | {old: former for old, (follower, former) in retired.items() if not follower}
+
+
+def _without_retired(config_type: Any, values: Mapping[str, Any], where: str, path: str = "") -> dict[str, Any]:
+    """Settings without those of ``RETIRED``; UsageError for one with another value than results may have."""
+    known, retired, rest = _types_of_fields(config_type), getattr(config_type, "RETIRED", {}), dict[str, Any]()
+    for name, value in values.items():
+        if name not in retired:
+            group = dataclasses.is_dataclass(known.get(name)) and isinstance(value, Mapping)
+            rest[name] = _without_retired(known[name], value, where, f"{path}{name}.") if group else value
+        elif (former := retired[name][1]) != (list(value) if isinstance(value, tuple) else value):
+            raise UsageError(f"the setting {path}{name} was removed", where=where, expected=f"nothing, or {former!r}", got=repr(value),
+                             remedy="leave it out")  # fmt: skip
+    return rest
 
 
 def result_settings(config: Any) -> dict[str, Any]:
@@ -64,15 +86,13 @@ def load(
         UsageError: unknown key (the nearest name is suggested), wrong type or value out of range.
         InputError: the YAML file is missing or malformed.
     """
-    values = to_dict(preset if preset is not None else config_type())
+    values = _without_retired(config_type, to_dict(preset if preset is not None else config_type()), "preset")
     if yaml_path is not None:
         content = _read_yaml(yaml_path)
         content.pop("verb", None)
-        _refuse_moved(content, str(yaml_path), config_type)
-        values = _merge(values, content, str(yaml_path), config_type)
+        values = _merge(values, _without_retired(config_type, content, str(yaml_path)), str(yaml_path), config_type)
     if overrides:
-        _refuse_moved(overrides, "flags", config_type)
-        values = _merge(values, dict(overrides), "flags", config_type)
+        values = _merge(values, _without_retired(config_type, overrides, "flags"), "flags", config_type)
     try:
         return TypeAdapter(config_type).validate_python(values)
     except ValidationError as error:
@@ -112,7 +132,7 @@ def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
 def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
     """Validate plain values as a ``config_type``; UsageError names the first wrong field."""
     try:
-        return TypeAdapter(config_type).validate_python(dict(values))
+        return TypeAdapter(config_type).validate_python(_without_retired(config_type, values, where))
     except ValidationError as error:
         raise first_problem(error, f"{where}: ", UsageError) from error
 
@@ -159,35 +179,6 @@ def _merge(
 def _types_of_fields(config_type: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(config_type) if dataclasses.is_dataclass(config_type) else {}
     return {f.name: hints[f.name] for f in dataclasses.fields(config_type)} if hints else {}
-
-
-def _refuse_moved(values: Mapping[str, Any], where: str, config_type: Any) -> None:
-    """UsageError that names all keys that a class lists in ``MOVED``, each with its new name."""
-    moved = dict(_moved_keys(values, config_type))
-    if not moved:
-        return
-    if len(moved) == 1:
-        ((old, new),) = moved.items()
-        what = f"the configuration key {old} " + ("was removed" if new is None else f"is now called {new}")
-        remedy = "leave it out" if new is None else "rename it (a dot is one level of YAML)"
-    else:
-        what = f"{len(moved)} configuration keys of an older version were renamed or removed"
-        renamed = [f"{old} -> {new}" for old, new in moved.items() if new is not None]
-        removed = [old for old, new in moved.items() if new is None]
-        lists = {"rename (a dot is one level of YAML):": renamed, "leave out:": removed}
-        remedy = "\n    ".join(line for title, keys in lists.items() if keys for line in (title, *keys))
-    raise UsageError(what, where=where, remedy=remedy)
-
-
-def _moved_keys(values: Mapping[str, Any], config_type: Any, path: str = "") -> Iterator[tuple[str, str | None]]:
-    """Dotted old and new names (None: removed) of the keys in ``values`` that are not called so any more."""
-    known, moved = _types_of_fields(config_type), getattr(config_type, "MOVED", {})
-    for name, value in values.items():
-        is_group, is_mapping = dataclasses.is_dataclass(known.get(name)), isinstance(value, Mapping)
-        if name in moved and (name not in known or (is_group and not is_mapping)):
-            yield f"{path}{name}", None if moved[name] is None else f"{path}{moved[name]}"
-        elif is_group and is_mapping:
-            yield from _moved_keys(value, known[name], f"{path}{name}.")
 
 
 def differences(old: Any, new: Any) -> list[str]:

@@ -178,7 +178,7 @@ def run_state(folder: Path) -> dict[str, Any]:
         state = store.read_json(folder / _STATE)
     except InputError as error:
         raise refused from error
-    known = isinstance(state, dict) and state.get("schema") in (1, store.RUN_SCHEMA)
+    known = isinstance(state, dict) and state.get("schema") == store.RUN_SCHEMA
     if not known or not all(isinstance(state.get(name), str) for name in ("verb", "key", "state")):
         raise refused
     return state

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 RUN_STATE, RUN_LOG, RUN_SCHEMA = "run.json", "log.jsonl", 2
-"""Record and log of the run that made a folder, and the record's schema (1: of an earlier version, without seal)."""
+"""Record and log of the run that made a folder, and the record's schema."""
 _MAX_JSON_BYTES = 512 * 1024 * 1024
 _CHUNK = 1 << 20
 
@@ -556,8 +556,8 @@ def with_check(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_holds(record: Mapping[str, Any]) -> bool:
-    """Whether a record is as ``with_check`` made it; one without a digest, of an earlier version, is taken."""
-    return "check" not in record or record["check"] == _check({name: value for name, value in record.items() if name != "check"})
+    """Whether a record is as ``with_check`` made it."""
+    return record.get("check") == _check({name: value for name, value in record.items() if name != "check"})
 
 
 def _check(record: Mapping[str, Any]) -> str:
@@ -567,7 +567,7 @@ def _check(record: Mapping[str, Any]) -> str:
 def verify_record(folder: Path) -> None:
     """Check the bookkeeping of a run folder: that the run is finished, and its record, log and manifest are as it wrote them.
 
-    Nothing is checked where no record lies (foreign folders, copies), and only the state of records of earlier versions.
+    Nothing is checked where no record lies (foreign folders, copies).
 
     Raises:
         InputError: the run is not finished. IntegrityError: something was altered or is missing.
@@ -579,8 +579,8 @@ def verify_record(folder: Path) -> None:
         record = read_json(path)
         if "asked" in record:
             return  # a chain of runs, whose record tells what was done, and is no result
-        state, schema = record["state"], record["schema"]
-        check, digests = (record.pop("check"), record["sealed"]) if (state, schema) == ("complete", RUN_SCHEMA) else ("", {})
+        state = record["state"]
+        check, digests = (record.pop("check"), record["sealed"]) if state == "complete" else ("", {})
         intact = check == (_check(record) if digests else "")
     except (InputError, KeyError, TypeError, AttributeError) as error:
         raise IntegrityError("the record of a run is damaged", where=str(path), got=str(error).split("\n")[0],

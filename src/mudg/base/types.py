@@ -437,7 +437,6 @@ class Condition:
         semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 = unknown.
         backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
         renders: what a fitted scene shows at the views, or None.
-        effect: f32[8] or None: weather and light that the colours have been given (``base.effects``).
         measured: what the points measured, where ``depth`` is something else: the published system's network is given depth that was
             resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
     """
@@ -452,7 +451,6 @@ class Condition:
     semantics: Tensor | None = None
     backdrop_semantics: Tensor | None = None
     renders: RenderPlanes | None = None
-    effect: Tensor | None = None
     measured: SparseDepth | None = None
     reference_in: Literal["tokens_and_frame", "frame", "nowhere"] = "tokens_and_frame"
 
@@ -460,7 +458,7 @@ class Condition:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
         one = (t, 1, h, w)
         checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
-        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one, effect=(8,))
+        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
         if self.renders is not None:
             checks.check_tensors(self.renders, color=(t, 3, h, w))
         if self.measured is not None:

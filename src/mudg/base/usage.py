@@ -56,7 +56,7 @@ class Usage:
 
     @classmethod
     def of_record(cls, values: Mapping[str, Any]) -> Usage:
-        """Of what `record` wrote; what an older version did not note is 0 or unknown."""
+        """Of what `record` wrote; what is not noted is 0 or unknown."""
         peak = values.get("peak_bytes")
         return cls(float(values.get("seconds", 0.0)), float(values.get("processor_s", 0.0)), None if peak is None else int(peak))
 

@@ -118,3 +118,11 @@ class Conditions(StrictRecord):
     """Season; none = as recorded."""
     response: ResponseSettings = Field(default_factory=ResponseSettings)
     """Camera response."""
+
+    @property
+    def changes_air_ground_or_light(self) -> bool:
+        """Whether fog, rain, snow, wet ground or another light is asked for; seasons and exposure alone do not count."""
+        weather = self.weather
+        rain, snow = weather.rain is not None and weather.rain.mm_h > 0, weather.snow
+        snowy = snow is not None and (snow.mm_h > 0 or snow.cover > 0)
+        return weather.fog is not None or rain or snowy or weather.wet > 0 or self.light.time != "as_recorded"

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 C0: Final = 0.28209479177387814
 """Value of the constant band: a colour of degree 0 is ``0.5 + C0 * f_dc``."""
-MAX_DEGREE: Final = 3
 
 Array = NDArray[np.float64]
 

@@ -32,7 +32,6 @@ from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
 from mudg.stages import learn
-from mudg.stages.adapting.cameras import camera_lessons
 from mudg.stages.adapting.clips import CLIPS, Plan, make_lesson, plan_clips, why_too_short
 from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, lessons_of
 from mudg.stages.config import AdaptConfig, LearnConfig
@@ -98,17 +97,16 @@ def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, 
 
 def _open_log(config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted: Path) -> tuple[LearntLog, list[Lesson]]:
     loaded = read_scene(scene)
-    fit_model = model_of_scene(fitted, loaded)
+    model_of_scene(fitted, loaded)  # refuses the fit of another scene
     names = cameras_of(loaded, config)
-    unknown = [name for name in (*names, *config.cameras_left_out) if name not in loaded.cameras]
+    unknown = [name for name in names if name not in loaded.cameras]
     if unknown or not names:
         raise InputError("the scene has no such camera", where=f"--cameras, {loaded.root}", expected=", ".join(loaded.cameras),
                          got=", ".join(unknown))  # fmt: skip
     camera = loaded.cameras[names[0]]
     width, height = model.image_size(camera.width, camera.height)
     scale = max(1, min(MOST_SCALE, camera.width // width))
-    lessons = lessons_of(loaded, config) + camera_lessons(loaded, config, fit_model)
-    return LearntLog(scene, fused, fitted, width, height, scale), lessons
+    return LearntLog(scene, fused, fitted, width, height, scale), lessons_of(loaded, config)
 
 
 def _make_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson], plan: Plan, work: Path) -> int:

@@ -7,7 +7,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,9 +18,7 @@ from mudg.base.errors import plain_lines
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from mudg.base.types import Scene, View
+    from mudg.base.types import Scene
     from mudg.data.scene.check import Finding
     from mudg.stages.config import RunConfig
     from mudg.stages.config.cost import SceneSize
@@ -122,7 +120,7 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     if not scene.sweeps:
         return {}, ["no preset of `mudg run` applies: the log has no LiDAR"]
     cores = native.default_threads()
-    size, machine = scene_size(scene), cost.Machine(cores, probe.speed(cores).now, os.cpu_count() or 1)
+    size, speed = scene_size(scene), probe.speed().now
     devices = {"cpu": memory.free_bytes()}
     if torch.cuda.is_available():
         devices["cuda"] = torch.cuda.mem_get_info()[0]
@@ -130,63 +128,39 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     records: dict[str, Any] = {}
     lines = []
     for device, free in devices.items():
-        found = cost.of_presets(size, machine, device)
+        found = cost.of_presets(size, cores, speed, device)
         lines += cost.in_words(found, free, device, disk)
         records[device] = {
             name: {"seconds": one.seconds, "total_s": one.total_s, "memory_bytes": one.memory_bytes, "written_bytes": one.written_bytes,
-                   "fits": cost.fits_machine(one, free, disk) if free else None,
-                   "steps": {step: asdict(of) for step, of in one.steps.items()}}
+                   "processor_s": one.processor_s, "fits": one.fits(free, disk) if free else None}
             for name, one in found.items()
         }  # fmt: skip
     log_px = int(str(PRESETS["fast"]["ingest.resolution"]))
     if max(size.width, size.height) > log_px and not size.exact:
         lines.append(f"of the log itself, in place of this scene, --preset fast makes images {log_px} pixels wide and takes less")
     lines.append(
-        f"speed of this machine at the moment: {machine.speed:.2f} of the one that forecasts were measured on, {cores} threads"
+        f"speed of this machine at the moment: {speed:.2f} of the one that forecasts were measured on, {cores} threads"
     )
     return records, lines
 
 
 def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
     """What forecasts depend on. The first sweep stands for all. config: of the run, whose cameras are shifted (None: the first)."""
-    import numpy as np
-
     from mudg.data.scene import read_points
     from mudg.stages.adapting.clips import why_not
     from mudg.stages.config import run_preset
     from mudg.stages.config.cost import SceneSize
 
     first = scene.frames[0].view.camera
-    sweep = scene.sweeps[0] if scene.sweeps else None
-    xyz = read_points(scene, sweep).xyz if sweep else np.zeros((0, 3), np.float32)
-    seen = (
-        _share_in_image(scene.frames[0].view, xyz @ sweep.world_from_lidar[:3, :3].T + sweep.world_from_lidar[:3, 3])
-        if sweep
-        else 0.0
-    )
+    points = len(read_points(scene, scene.sweeps[0]).xyz) if scene.sweeps else 0
     exact = scene.source.recipe is not None
     config = config or run_preset()
     cameras = [name for name in config.synthesize.cameras or (first.name,) if name in scene.cameras]
     return SceneSize(
-        len(scene.frames), sum(len(scene.frames_of(name)) for name in cameras), first.width, first.height, len(xyz), exact, seen=seen,
+        len(scene.frames), sum(len(scene.frames_of(name)) for name in cameras), first.width, first.height, points, exact,
         labelled=all("semantics" in frame.labels for frame in scene.frames),
         adapts=not exact and not why_not(scene, replace(config.adapt, cameras=tuple(cameras))),
     )  # fmt: skip
-
-
-def _share_in_image(view: View, world: np.ndarray) -> float:
-    """Share of points (N, 3), in metres of the world, that project into a view; what hides them is not asked."""
-    import numpy as np
-
-    camera_from_world = np.linalg.inv(view.world_from_cam)
-    x, y, z = (world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]).T
-    ahead = z > 0.1
-    u, v = (
-        view.camera.fx * x[ahead] / z[ahead] + view.camera.cx,
-        view.camera.fy * y[ahead] / z[ahead] + view.camera.cy,
-    )
-    inside = (u >= 0) & (u < view.camera.width) & (v >= 0) & (v < view.camera.height)
-    return float(inside.sum()) / max(1, len(world))
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

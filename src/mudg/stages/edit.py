@@ -61,7 +61,10 @@ def run(
     cloud = None if clouds is None else read_fused(clouds)
     drive = carry_out(parsed, model, loaded, cloud)
     if parts.whole and conditions_of(parsed.canonical()) is not None:
-        log.info("edit: `mudg render` shows weather and light; images and LiDAR of the edited scene stay as recorded")
+        beams = "its LiDAR sweeps are in fog and rain" if drive.plan.weather_of_beams else "so do its LiDAR sweeps"
+        log.info(f"edit: `mudg render` shows weather and light; images of the edited scene stay as recorded, {beams}")
+    if parts.whole and drive.plan.weather_of_beams is not None:
+        inputs["weather of beams"] = "fog, rain"  # another result than before sweeps showed them
     if parts.whole and drive.plan.background is not None:
         log.info("edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured that street")
     if config.harmonize.on and not parts.whole:

@@ -48,10 +48,8 @@ from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.clips import class_weights, draw_clips
 from mudg.stages.learning.models import (
     Model,
-    check_effects,
     draw_weights,
     freeze,
-    hold_effects,
     hold_finisher,
     kind_of,
     starting_model,
@@ -85,7 +83,6 @@ def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
-        check_effects(model, fresh, config)
         directory = _open(config, out, overwrite, ranks)
         if directory is None:
             return out / "model"
@@ -177,14 +174,13 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
             )
             learn_codec.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
-        for name in ("refiner", "finisher", "effects"):
+        for name in ("refiner", "finisher"):
             part = getattr(model, name, None)
             if name in fresh and part is not None:
                 draw_weights(part, config.seed, f"{name} weights")
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
-        hold_effects(model, config.data.weathers)
         hold_finisher(model, fresh, learn_clips.have_patches(config, folder, config.data.skip_cities))
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 
@@ -333,7 +329,7 @@ def _train_network(
 
 def _loss_settings(config: LearnConfig, class_weights: Tensor) -> LossSettings:
     data = config.data
-    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout, data.effect_dropout,
+    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout,
                         frame_dropout=data.reference_dropout_scope == "tokens_and_frame")  # fmt: skip
 
 

@@ -6,7 +6,6 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -202,10 +201,9 @@ def _forecast(config: RunConfig, scene: Path) -> str:
     from mudg.stages.config import cost
     from mudg.stages.doctor import scene_size
 
-    size, cores = scene_size(read_scene(scene), config), native.default_threads()
-    speed = probe.speed(cores)
+    size, cores, speed = scene_size(read_scene(scene), config), native.default_threads(), probe.speed()
     kind = "cpu" if config.device == "cpu" or devices.usual_device() == "cpu" else "cuda"
-    idle, now = (cost.estimate(config, size, cost.Machine(cores, one, os.cpu_count() or 1), kind) for one in (speed.idle, speed.now))
+    idle, now = (cost.estimate(config, size, cores, one, kind) for one in (speed.idle, speed.now))
     return cost.in_a_line(idle, now)
 
 

@@ -28,7 +28,6 @@ from torch.nn import functional
 from mudg import native
 from mudg.base import log, memory, palette, store
 from mudg.base.config import result_settings
-from mudg.base.effects import effect_vector
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
@@ -49,7 +48,7 @@ from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_image, read_label, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
 from mudg.models.mdm.codec import Modality
-from mudg.models.mdm.files import digest, folder_of, takes_effects
+from mudg.models.mdm.files import digest, folder_of
 from mudg.models.mdm.model import MDM
 from mudg.models.published.files import is_published
 from mudg.models.scene.model import SceneModel
@@ -170,10 +169,11 @@ def _edited(config: SynthesizeConfig, script: EditScript, given: tuple[Scene, Pa
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
-    """Whether views are generated in the weather and light of a script: from renders of a fit, by a model that takes an effect vector,
-    or by a published-type one from points and a reference in that weather."""
-    wanted = effect_vector(editing_weather.conditions_of(script.canonical())) is not None and fitted and config.condition == "full"
-    return wanted and (is_published(config.model) or takes_effects(config.model))
+    """Whether views are generated in the weather and light of a script: by a published-type model, from points and a reference in that
+    weather, whose distances a fit tells."""
+    asked = editing_weather.conditions_of(script.canonical())
+    wanted = asked is not None and asked.changes_air_ground_or_light and fitted and config.condition == "full"
+    return wanted and is_published(config.model)
 
 
 def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:

@@ -67,7 +67,7 @@ class Demo(Output):
     """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000
     iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
     fast: bool = False
-    """The same as --preset fast, 3 m to each side: about a minute on 2 cores."""
+    """The same as --preset fast, 3 m to each side: one to two minutes on 2 cores."""
     seed: Annotated[int | None, Flag("INT")] = None
     """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     shifts_m: tuple[float, ...] = ()

@@ -220,7 +220,6 @@ export class Renderer {
     gl.uniform3fv(places.eye, view.eye);
     gl.uniform2f(places.colorRange, loaded.scene.facts.color_low, loaded.scene.facts.color_high);
     gl.uniform1f(places.harmonicStep, loaded.scene.facts.harmonic_step ?? 0);
-    gl.uniform1i(places.turning, loaded.scene.facts.harmonics_in_world ? 0 : 1); // colours turn with their object
     const { fog, veil, snow } = preview(this.conditions, loaded.scene.sky);
     gl.uniform4fv(places.fog, fog);
     gl.uniform4fv(places.veil, veil);

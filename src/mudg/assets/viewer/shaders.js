@@ -14,7 +14,7 @@ precision highp float; precision highp int; precision highp usampler2DArray; pre
 export const splatVertex = (degree, texels, width, rows) => HEAD + `
 uniform usampler2DArray data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
-uniform vec2 colorRange; uniform vec4 fog, veil, snow; uniform uint ground; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias, turning;
+uniform vec2 colorRange; uniform vec4 fog, veil, snow; uniform uint ground; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias;
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -106,7 +106,7 @@ void main() {
   if (layer == 0) {
     uvec3 levels = uvec3(second.w, second.w >> 8, second.w >> 16) & 255u;
     payload.rgb = mix(vec3(colorRange.x), vec3(colorRange.y), vec3(levels) / 255.0);
-    ${degree ? "payload.rgb += harmonics(normalize(turning ? fromEye * worldFromNode : fromEye));" : ""}
+    ${degree ? "payload.rgb += harmonics(normalize(fromEye * worldFromNode));" : ""}
     payload.rgb = max(payload.rgb, 0.0); // what follows is a preview
     if (vote.x < 32u && ((ground >> vote.x) & 1u) == 1u) payload.rgb = mix(payload.rgb, snow.rgb, snow.a);
     float way = length(fromEye), thin = fog.a * way + veil.x * max(way - veil.y, 0.0) + veil.z * max(way - veil.w, 0.0);

@@ -16,8 +16,6 @@ from mudg.core.raster.rasterize import RasterConfig, rasterize
 GAUSSIANS, WIDTH, HEIGHT = 20_000, 240, 160
 REFERENCE_S: Final = 0.0108
 """Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `stages/config/cost.py` was measured."""
-SHARED: Final = 0.79
-"""Share of a pass that is divided among the cores."""
 
 
 def scene() -> tuple[Gaussians, View]:
@@ -38,33 +36,26 @@ def scene() -> tuple[Gaussians, View]:
 
 
 class Speed(NamedTuple):
-    """Speed of a machine as a share of the reference's: over the time of measurement, which other programs at work lower, and of its
-    fastest pass, which they disturb least."""
+    """Speed of a core as a share of the reference's: undisturbed, and with what other programs leave of it now."""
 
     now: float
     idle: float
 
 
-def speed(threads: int, for_s: float = 0.4) -> Speed:
-    """Measure the speed of this machine with so many threads at work.
-
-    Args:
-        for_s: seconds to measure for, after one pass to warm up.
-    """
+def speed(passes: int = 12) -> Speed:
+    """Measure the speed of a core of this machine, by the processor time of one thread: other programs at work hardly change that."""
     gaussians, view = scene()
     before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     try:
-        passes_s: list[float] = []
         one_pass(gaussians, view)
-        while sum(passes_s) < for_s:
-            began = time.perf_counter()
+        began_s, began_processor_s = time.perf_counter(), time.process_time()
+        for _ in range(passes):
             one_pass(gaussians, view)
-            passes_s.append(time.perf_counter() - began)
+        processor_s, seconds = time.process_time() - began_processor_s, time.perf_counter() - began_s
     finally:
         torch.set_num_threads(before)
-    expected_s = REFERENCE_S * (1 - SHARED + SHARED / threads)
-    return Speed(expected_s * len(passes_s) / sum(passes_s), expected_s / min(passes_s))
+    return Speed(REFERENCE_S * passes / max(seconds, processor_s), REFERENCE_S * passes / processor_s)
 
 
 def one_pass(gaussians: Gaussians, view: View) -> None:

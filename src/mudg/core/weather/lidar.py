@@ -25,7 +25,7 @@ BACKSCATTER = 0.046
 PULSE_M = 3.0
 """Half-power pulse length as a distance: 20 ns of light, there and back."""
 SOFT_JITTER_M = 0.3
-_LOST, _HARD, _SOFT = 0, 1, 2
+LOST, HARD, SOFT = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +65,12 @@ class BeamReturns:
     @property
     def kept(self) -> NDArray[np.bool_]:
         """bool[N]: something returned."""
-        return self.kind != _LOST
+        return self.kind != LOST
 
     @property
     def soft(self) -> NDArray[np.bool_]:
         """bool[N]: the fog returned."""
-        return self.kind == _SOFT
+        return self.kind == SOFT
 
 
 def _pulse(x: Array) -> Array:
@@ -122,14 +122,14 @@ def in_fog(
     place = np.maximum.accumulate(np.where(powers >= best, np.arange(len(powers)), 0))
     index = np.clip(np.searchsorted(distances, range_m) - 1, 0, len(distances) - 1)
     soft = best[index]
-    kind = np.where(np.maximum(hard, soft) < sensor.threshold, _LOST, np.where(soft > hard, _SOFT, _HARD)).astype(
+    kind = np.where(np.maximum(hard, soft) < sensor.threshold, LOST, np.where(soft > hard, SOFT, HARD)).astype(
         np.uint8
     )
     jitter = seeds.numpy_rng(seed, len(range_m), "soft returns").normal(0, SOFT_JITTER_M, len(range_m))
     near = np.clip(distances[place[index]] + jitter, np.minimum(sensor.cross_from_m, range_m), range_m)
-    shown = np.where(kind == _SOFT, near, range_m)
-    power = np.where(kind == _SOFT, soft, hard)
-    return BeamReturns(shown, np.where(kind == _LOST, 0.0, power * math.pi * range_m**2), kind)
+    shown = np.where(kind == SOFT, near, range_m)
+    power = np.where(kind == SOFT, soft, hard)
+    return BeamReturns(shown, np.where(kind == LOST, 0.0, power * math.pi * range_m**2), kind)
 
 
 def in_rain(
@@ -143,7 +143,7 @@ def in_rain(
     sigma = 0.02 * range_m * (1 - math.exp(-mm_h)) ** 2
     noise = seeds.numpy_rng(seed, len(range_m), "rain range").normal(0, 1, len(range_m)) * sigma
     return BeamReturns(np.where(kept, np.maximum(range_m + noise, 0.1), range_m), np.where(kept, reflectance * share, 0.0),
-                   np.where(kept, _HARD, _LOST).astype(np.uint8))  # fmt: skip
+                   np.where(kept, HARD, LOST).astype(np.uint8))  # fmt: skip
 
 
 def rain_share(range_m: Array, mm_h: float) -> Array:
@@ -172,19 +172,19 @@ def sweep_in_weather(
     distance = np.maximum(np.linalg.norm(xyz, axis=1), 1e-3)
     beams = xyz / distance[:, None]
     shown, intensity = distance, points.intensity.astype(np.float64)
-    kind = np.full(len(xyz), _HARD, np.uint8)
+    kind = np.full(len(xyz), HARD, np.uint8)
     if weather.fog is not None:
         fog = in_fog(shown, intensity, weather.fog.visibility_m, seed, sensor)
         shown, intensity, kind = fog.range_m, fog.intensity, fog.kind
     if weather.rain is not None:
         # fog that returned stands near the sensor and is recorded as it is
         rain = in_rain(shown, intensity, weather.rain.mm_h, seed, sensor)
-        hard = kind == _HARD
+        hard = kind == HARD
         shown, intensity = np.where(hard, rain.range_m, shown), np.where(hard, rain.intensity, intensity)
         kind = np.where(hard, rain.kind, kind).astype(np.uint8)
-    kept = kind != _LOST
+    kept = kind != LOST
     classes = (
-        None if points.classes is None else np.where(kind == _SOFT, UNLABELLED, points.classes).astype(np.uint8)[kept]
+        None if points.classes is None else np.where(kind == SOFT, UNLABELLED, points.classes).astype(np.uint8)[kept]
     )
     moved = (beams * shown[:, None]).astype(np.float32)[kept]
     result = SweepPoints(moved, np.clip(intensity, 0, 1).astype(np.float32)[kept], points.dt_s[kept], classes)

@@ -66,12 +66,10 @@ CHOICE: Final = LogChoice()
 VEHICLES: Final = frozenset({"car", "truck", "bus", "cyclist"})
 
 DEVELOPMENT: tuple[int, ...] = (2100000, 2100001, 2100004, 2100007)
-"""Logs to look at while choosing."""
+"""Logs to look at while choosing: the first that `choose` finds from the first of them on."""
 REPORTED: tuple[int, ...] = (2100100, 2100101, 2100102, 2100103, 2100151, 2100154, 2100157, 2100242)
-"""Logs whose scores are reported and on which nothing is chosen."""
+"""Logs whose scores are reported and on which nothing is chosen; found in the same way."""
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
-FIRST_SEEDS: dict[str, int] = {"development": 2_100_000, "reported": 2_100_100}
-"""Where `choose` starts. A list of the same length is what it gives."""
 
 
 def log_config(seed: int, rules: LogRules = STANDARD) -> CityConfig:

@@ -10,7 +10,8 @@ COLUMNS: Final = 28
 
 # kinds of objects; the same numbers stand in native/city_world.h
 BUILDING, TREE, HEDGE, LAMP, SIGN, SIGNAL, WALL, FENCE, POLE, BIN, BENCH = range(1, 12)
-SHELTER, HILL, BUSH, GANTRY, BOLLARD, MOTORBIKE, PLANTER, PART = range(12, 20)
+SHELTER, HILL, BUSH = range(12, 15)
+BOLLARD, MOTORBIKE, PLANTER, PART = range(16, 20)
 CAR, VAN, TRUCK, BUS, PEDESTRIAN, CYCLIST, TANKER = range(50, 57)
 
 LABELS: Final = {CAR: "car", VAN: "car", TRUCK: "truck", BUS: "bus", PEDESTRIAN: "pedestrian", CYCLIST: "cyclist", TANKER: "truck"}

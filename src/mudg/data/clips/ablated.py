@@ -18,7 +18,7 @@ from mudg.base.types import Condition, FusedCloud, Photo, Track, View
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition
 from mudg.data.clips.vacated import VacatedAt
-from mudg.data.clips.weathered import InWeather, WeatheredPoints, weathered
+from mudg.data.clips.weathered import InWeather, WeatheredPoints
 
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
 """full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
@@ -34,7 +34,8 @@ COVERED = 0.5
 @dataclass(frozen=True, slots=True)
 class ConditionSources:
     """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the log's
-    sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and its weather."""
+    sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and,
+    for published-type models, its weather."""
 
     cloud: FusedCloud
     tracks: Sequence[Track]
@@ -64,8 +65,7 @@ def conditions_of(
     if parts == "full":
         how, render_at = sources.weather, sources.render_at
         recolor = WeatheredPoints(how, render_at) if rules.published and how is not None and render_at is not None else None
-        small, fine = build_conditions(cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor)
-        return (small, fine) if how is None or rules.published else in_weather(small, fine, how)
+        return build_conditions(cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor)
     if parts == "repair":
         return _of_renders(sources, views, kept)
     if rules.published:
@@ -81,12 +81,6 @@ def conditions_of(
     images = build_conditions(cloud, tracks, views, recorded, replace(rules, images_per_view=1), kept)
     small, fine = (_with_backdrop(a, b, rules, parts) for a, b in zip(points, images, strict=True))
     return small, fine
-
-
-def in_weather(small: Condition, fine: Condition, how: InWeather) -> tuple[Condition, Condition]:
-    """A condition and the same on the fine grid in other weather or light."""
-    made = weathered(small, how)
-    return made, made if fine is small else weathered(fine, how)
 
 
 def _of_renders(

@@ -26,10 +26,9 @@ from mudg.base.log import progress
 from mudg.base.types import Clip, Condition, FinePatch, Photo, View
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.trajectory import ego_left_world
-from mudg.core.weather import DriveFacts
 from mudg.data.city import CityConfig, CityTruth, CityWorld
 from mudg.data.city.sensors import SensorFaults
-from mudg.data.clips import varied, weathered
+from mudg.data.clips import varied
 from mudg.data.clips.city_log import CityLog, record_with_faults
 from mudg.data.clips.condition import ConditionRules, RenderAt, WarpSource, build_conditions
 from mudg.data.clips.near_points import NearSweeps, near_condition, simulated_lateness_s
@@ -89,8 +88,6 @@ class CityClipRules:
     resolution; recorded images are 2 to 4 times larger than the clips."""
     textures: str = ""
     """Varied cities: folder of photographic textures and skies, used by most cities (empty = none)."""
-    weathers: int = 0
-    """With `fitted`: every clip this often, each time in other weather or light (`weathered.py`), of cities on clear days; 0 = as it is."""
 
     @property
     def frames(self) -> int:
@@ -113,7 +110,7 @@ def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
 
 def fine_of(rules: CityClipRules, city: int) -> int:
     """How many times larger than the clips the recorded images of a city are."""
-    if not rules.fitted or rules.weathers or city >= HELD_OUT:
+    if not rules.fitted or city >= HELD_OUT:
         return rules.fine
     return int(seeds.numpy_rng(rules.seed, city, "image size").choice([2, 3, 4], p=[0.55, 0.3, 0.15]))
 
@@ -127,7 +124,7 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
     """The city's configuration."""
     seed = seeds.key(0 if city >= HELD_OUT else rules.seed, city, "city") & 0x7FFFFFFF
     fine, (width, height) = fine_of(rules, city), size_of(rules, city)
-    plain = CityConfig(seed=seed, n_frames=FRAMES, width=width * fine, height=height * fine, light="day" if rules.weathers else "auto")
+    plain = CityConfig(seed=seed, n_frames=FRAMES, width=width * fine, height=height * fine, light="auto")
     if city >= HELD_OUT:
         return plain
     if is_varied(rules, city):
@@ -246,22 +243,12 @@ def make_clips(
             condition, fine = build_conditions(log.cloud, tracks, claimed, given, conditions, cache, render_at)
         truths = [log.truth(view.resized(*size)) for view in views]
         clip = replace(clip_from_truth(condition, truths), shift_m=shift_m)
-        if rules.fitted and not rules.weathers:
+        if rules.fitted:
             place = seeds.numpy_rng(rules.seed, city * 16 + number, "patch")
             full = clip_from_truth(fine, [log.truth(view) for view in views])
             clip = replace(clip, fine=cut_patch(full, scale, patch_side(size), place))
         clips.append(clip)
-    if rules.weathers and render_at is not None:
-        return _in_weathers(rules, city, log, clips, weathered.witnesses(log.world, render_at, size))
     return clips
-
-
-def _in_weathers(rules: CityClipRules, city: int, log: CityLog, clips: Sequence[Clip], drive: DriveFacts) -> list[Clip]:
-    """The clips of a clear city, each in `rules.weathers` weathers."""
-    each = [clip for clip in clips for _ in range(rules.weathers)]
-    key = seeds.key(rules.seed, city, "weathers")
-    pairs = weathered.pairs_of([clip.condition for clip in each], log.world, drive, key)
-    return [replace(clip_from_truth(given, truths), shift_m=clip.shift_m) for clip, (given, truths, _) in zip(each, pairs, strict=True)]
 
 
 def near_sweeps(log: CityLog) -> NearSweeps:

@@ -15,8 +15,6 @@ and, where a fitted scene was rendered,
     render u8[K,T,3,H,W]  render_depth f16[K,T,H,W]  alpha, certainty u8[K,T,H,W] (of 255)  render_ids u8[K,T,H,W]
     rendered bool[K]: false = this clip has no renders
 
-and, of clips in other weather or light, effect f32[K,8] (`base.effects`)
-
 and, of recorded logs with annotated depth, depth_confidence u8[K,T,H,W] (of 255)
 
 and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0 = nothing
@@ -38,7 +36,6 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from mudg.base import seeds, store
-from mudg.base.effects import EFFECTS
 from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Camera, Clip, Condition, FinePatch, SparseDepth, View
@@ -110,9 +107,6 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
             "render_ids": np.stack([r.semantics[:, 0].numpy() for r in shown]),
             "rendered": np.array([c.renders is not None for c in conditions]),
         }  # fmt: skip
-    if any(c.effect is not None for c in conditions):
-        nothing = torch.zeros(len(EFFECTS))
-        arrays["effect"] = np.stack([(nothing if c.effect is None else c.effect).numpy() for c in conditions])
     measured = [c.measured for c in conditions if c.measured is not None]
     if measured and len(measured) == len(clips):
         arrays["measured"] = np.stack([f16(m.depth) * m.valid[:, 0].numpy() for m in measured])
@@ -206,6 +200,9 @@ def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
 def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Clip:
     """A clip, or its patch, from the arrays whose names begin with `prefix`."""
     there = set(shard.keys())
+    if f"{prefix}effect" in there:
+        raise InputError("the clips are of generated cities in other weather, which are no longer learned from", got="an array effect",
+                         remedy="choose another folder of clips: it is filled anew")  # fmt: skip
     rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
     names = [
         *_PER_FRAME,
@@ -232,7 +229,7 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     condition = Condition(
         views, image(found["color"]), plane(found["sparse_depth"]), (flags & FLAG_VALID) > 0, image(reference),
         warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
-        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders, effect=_effect_in(shard, f"{prefix}effect", clip),
+        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders,
         measured=None if measured is None else SparseDepth(measured, measured > 0),
     )  # fmt: skip
     return Clip(
@@ -242,17 +239,11 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     )  # fmt: skip
 
 
-def _effect_in(shard: Any, name: str, clip: int) -> Tensor | None:
-    """The effect vector of a clip; None: it has none."""
-    found = torch.from_numpy(shard.get_slice(name)[clip]) if name in set(shard.keys()) else None
-    return found if found is not None and bool(found.any()) else None
-
-
 def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %. Clips in other weather keep their colours, which are what is learned.
+    +-8 %; the condition gets a further exposure error of +-3 %.
     Given classes: see `ClassMistakes`. A mirrored clip keeps its poses and intrinsics: they then describe the mirror image of the place.
 
     Args:
@@ -264,8 +255,6 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     error = rng.uniform(0.97, 1.03)
 
     def curve(x: Tensor, extra: float) -> Tensor:
-        if clip.condition.effect is not None:
-            return x
         x = x * torch.as_tensor(gain * extra, dtype=x.dtype).view(3, 1, 1)
         x = x.clamp(1e-4, 1) ** gamma
         grey = x.mean(-3, keepdim=True)

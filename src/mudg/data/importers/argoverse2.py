@@ -49,7 +49,6 @@ RING_CAMERAS: Final = (
     "ring_front_center", "ring_front_left", "ring_front_right", "ring_side_left", "ring_side_right",
     "ring_rear_left", "ring_rear_right",
 )  # fmt: skip
-STEREO_CAMERAS: Final = ("stereo_front_left", "stereo_front_right")
 CAMERAS: Final[Mapping[str, str]] = {
     "ring_front_center": "front", "ring_front_left": "front_left", "ring_front_right": "front_right",
     "ring_side_left": "side_left", "ring_side_right": "side_right", "ring_rear_left": "rear_left",

@@ -196,8 +196,6 @@ def losses(name: str, request: WriteRequest) -> list[str]:
         found.append("the sky (--sky sphere adds it as Gaussians)")
     if "harmonics" not in carries and scene.degree > 0:
         found.append("colours that depend on the direction of view")
-    if moving and request.time_s is None and scene.facts.get("harmonics") == "world":
-        found.append("colours of objects that stay as they are while the object turns (they turn with it)")
     if kept := {key: value for key, value in request.drawing.items() if key not in carries}:
         found.append("how the fit draws Gaussians (" + ", ".join(f"{key} {value}" for key, value in kept.items()) + ")")
     return found

@@ -13,14 +13,13 @@ from mudg.models.mdm.network import MDMConfig
 
 
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what follows the denoiser, in the use of renders and effects, and in the size trained at."""
+    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained at."""
     plain = {
         "refine_widths": (),
         "refine_blocks": (),
         "finish_widths": (),
         "finish_blocks": (),
         "renders": False,
-        "effects": 0,
         "area_px": 0,
     }
     without = lambda config: replace(config, **plain)  # noqa: E731

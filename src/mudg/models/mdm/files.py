@@ -2,7 +2,6 @@
 
 model.json                configuration, sha256 of the weight files, facts (recipe, scores); of published-type models also their kind
 weights_NN.safetensors    weights in fp16
-effects_NN.safetensors    those of the effects, of models that take an effect vector
 MODEL_CARD.md             for people
 """
 
@@ -24,19 +23,17 @@ _ASSETS = Path(__file__).resolve().parents[2] / "assets"
 EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
 """Models that come with the package, by the names that stand for their folders."""
 SHARD_BYTES = 15 * 1024 * 1024
-EFFECTS_PREFIX = "effects."
-"""What the names of the effects' weights begin with."""
 
 FORMER_FIELDS: dict[str, dict[str, Any]] = {
     "top": {
         "joint": True, "head": "x0", "copy_condition": True, "backdrop": True, "mask_planes": "valid_image", "reference": "warped",
-        "given_classes": True,
+        "given_classes": True, "effects": 0,
     },
     "codec": {"kind": "patch", "depth_code": "log", "semantics_code": "shares"},
 }  # fmt: skip
 """Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is still built."""
 
-LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": [], "effects": 0}
+LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": []}
 """Fields that earlier model files lack, with what their models are."""
 
 
@@ -79,12 +76,6 @@ def uses_renders(path: Path | str) -> bool:
     return isinstance(config, Mapping) and bool(config.get("renders", LATER_FIELDS["renders"]))
 
 
-def takes_effects(path: Path | str) -> bool:
-    """Whether a model's condition may hold an effect vector; published-type models' cannot."""
-    config = read_description(path).get("config")
-    return isinstance(config, Mapping) and bool(config.get("effects", LATER_FIELDS["effects"]))
-
-
 def config_from_dict(values: Any, where: str = "model configuration") -> MDMConfig:
     """Inverse of `dataclasses.asdict`.
 
@@ -112,11 +103,7 @@ def _without_former(values: Any, group: str, where: str) -> Any:
 def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
     """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
     with store.atomic_directory(folder) as partial:
-        state = model.state_dict()
-        effects = {name: value for name, value in state.items() if name.startswith(EFFECTS_PREFIX)}
-        plain = {name: value for name, value in state.items() if name not in effects}
-        files = shards.write_shards(partial, plain, SHARD_BYTES, torch.float16)
-        files |= shards.write_shards(partial, effects, SHARD_BYTES, torch.float16, "effects")
+        files = shards.write_shards(partial, model.state_dict(), SHARD_BYTES, torch.float16)
         store.write_text(partial / "MODEL_CARD.md", card)
         description = {"schema": 1, "config": dataclasses.asdict(model.config), "files": files, "facts": dict(facts)}
         store.write_json(partial / MODEL_FILE, description)

@@ -51,7 +51,6 @@ from mudg.models.mdm.codec import (
     code_to_depth,
     semantic_shares,
 )  # fmt: skip
-from mudg.models.mdm.effects import Effects, Tuning
 from mudg.models.mdm.finisher import Finisher, Made, class_scores, finish_in_tiles
 from mudg.models.mdm.network import (
     ConditionPixels,
@@ -77,8 +76,7 @@ class ConditionLatents:
     planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
     [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
     trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of models that use
-    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w]. effect: of models that take effect vectors, these,
-    [B,8]; None: no clip has one.
+    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
     """
 
     planes: Tensor
@@ -88,7 +86,6 @@ class ConditionLatents:
     pixels: ConditionPixels
     render: dict[Modality, Tensor] = field(default_factory=dict)
     certainty: Tensor | None = None
-    effect: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -109,14 +106,12 @@ class LossSettings:
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
-    effect_dropout     share of the clips that go without their effect vector; the small kind
     frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the published kind
     """
 
     class_weights: Tensor | None
     refined_share: float
     reference_dropout: float
-    effect_dropout: float = 0.0
     frame_dropout: bool = False
 
 
@@ -188,11 +183,6 @@ class MDM(nn.Module):
         if config.finish_widths:
             (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
             self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
-        self.effects: Effects | None = None
-        if config.effects:
-            refined = [] if self.refiner is None else self.refiner.block_sides
-            self.effects = Effects(config.embed_width, self.net.block_sides, refined, config.effects)
-            self.effects.to(memory_format=torch.channels_last)
 
     @property
     def device(self) -> torch.device:
@@ -230,15 +220,15 @@ class MDM(nn.Module):
         far = self.codec.encode_rgb(given.backdrop)
         masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
         planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
-        pixels, effect = self._pixels_of(given), None if self.effects is None else given.effect
+        pixels = self._pixels_of(given)
         if not self.config.renders:
-            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, effect=effect)
+            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
         shown = given.renders
         render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
         classes, certainty = cell_shares(shown.semantics), cell_means(shown.certainty, factor)
         alpha = cell_means(shown.alpha, factor)
         planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
-        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty, effect)
+        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty)
 
     def _pixels_of(self, given: Stacked) -> ConditionPixels:
         """What the refiner sees of a batch of conditions, [B*T,..]."""
@@ -261,13 +251,8 @@ class MDM(nn.Module):
         Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
         """
         sizes = [x[m].shape[2] for m in MODALITIES]
-        given, effect = torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2), None
-        if self.effects is not None and encoded.effect is not None:
-            features = self.effects.features(encoded.effect)
-            effect = self.effects.time(features), Tuning(self.effects.net, features.repeat_interleave(given.shape[1], 0))
-        out, gates = self.net(given, t, effect).split(
-            [sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2
-        )
+        given = torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2)
+        out, gates = self.net(given, t).split([sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2)
         copy_rgb, copy_depth, copy_far, copy_classes, *copy_render = gates.split(1, 2)
         rgb, depth, classes = out.split(sizes, 2)
         if encoded.certainty is not None:
@@ -290,7 +275,7 @@ class MDM(nn.Module):
         With a refiner its terms are added, and their gradient reaches the denoiser.
         """
         with torch.no_grad():
-            encoded = self._some_without_effect(self.encode_condition([clip.condition for clip in clips]), part, settings)
+            encoded = self.encode_condition([clip.condition for clip in clips])
             truth = self.encode_truth(clips)
         generator = seeds.torch_generator(part.seed, part.step, "noise")
         steps = noise.stratified_steps(part.count, len(self.schedule), generator)
@@ -312,15 +297,6 @@ class MDM(nn.Module):
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
         return Losses(total, terms)  # type: ignore[arg-type]
-
-    @staticmethod
-    def _some_without_effect(encoded: ConditionLatents, part: BatchPart, settings: LossSettings) -> ConditionLatents:
-        """The conditions, a share of them (by clip, see `BatchPart`) without their effect vector."""
-        if encoded.effect is None or not settings.effect_dropout:
-            return encoded
-        draws = [seeds.numpy_rng(part.seed, part.step, f"effect, clip {part.first + n}").random() for n in range(len(encoded.effect))]
-        kept = torch.tensor([draw >= settings.effect_dropout for draw in draws], device=encoded.effect.device)
-        return replace(encoded, effect=encoded.effect * kept[:, None])
 
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
@@ -363,7 +339,7 @@ class MDM(nn.Module):
         latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
         factor = self.codec.factor
         tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
-        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames, encoded.effect)
+        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
         return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
 
     def _finisher_terms(
@@ -393,7 +369,7 @@ class MDM(nn.Module):
         tall, wide = (slice(cut.start * factor, cut.stop * factor) for cut in around)
         latents: dict[Modality, Tensor] = {m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()}
         pixels = encoded.pixels.map(lambda x: x[number * frames : (number + 1) * frames]).crop(tall, wide)
-        small = self._made(self.refine(latents, pixels, frames, None if encoded.effect is None else encoded.effect[own]))
+        small = self._made(self.refine(latents, pixels, frames))
         size = (tall.stop - tall.start) * patch.scale, (wide.stop - wide.start) * patch.scale
         top, left = (patch.row - tall.start) * patch.scale, (patch.column - wide.start) * patch.scale
         return small.enlarged(size, (top, top + patch.clip.rgb.shape[-2]), (left, left + patch.clip.rgb.shape[-1]))
@@ -427,21 +403,15 @@ class MDM(nn.Module):
             spans.append(slice(start, start + size))
         return spans[0], spans[1]
 
-    def refine(
-        self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int, effect: Tensor | None = None
-    ) -> Refined:
-        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`); `effect` [B,8] of the clips."""
+    def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
-        tuning = None
-        if self.effects is not None and effect is not None:
-            tuning = Tuning(self.effects.refine, self.effects.features(effect).repeat_interleave(frames, 0))
-        return self.refiner(self.codec, latents, given, frames, tuning)
+        return self.refiner(self.codec, latents, given, frames)
 
     def trained_part(self) -> nn.ModuleDict:
-        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner, finisher and
-        effects."""
-        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher, "effects": self.effects}
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner and finisher."""
+        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher}
         return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
@@ -494,9 +464,9 @@ class MDM(nn.Module):
                 decoded = self.codec.decode(latents)
                 confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
             else:
-                pixels, effect = encoded.pixels, encoded.effect
+                pixels = encoded.pixels
                 del encoded  # its planes are large
-                made = self._made(self.refine(latents, pixels, len(condition.views), effect))
+                made = self._made(self.refine(latents, pixels, len(condition.views)))
                 decoded, log_error = self._decoded(made), made.log_error
                 confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
                 if request.n_samples > 1:

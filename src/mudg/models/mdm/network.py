@@ -35,7 +35,6 @@ from mudg.models.mdm.codec import (
     PatchCodec,
     temporal_shift,
 )  # fmt: skip
-from mudg.models.mdm.effects import Tuning
 
 COPY_SCORE = 6.0
 """What a class given by the condition adds to its score when the gate is open."""
@@ -69,8 +68,6 @@ class MDMConfig:
     finish_widths: tuple[int, ...] = ()
     """Channels of the finisher (`models.mdm.finisher`) at half and at a quarter of the camera's resolution; empty = no finisher."""
     finish_blocks: tuple[int, ...] = ()
-    effects: int = 0
-    """Channels of the layers that an effect vector gates (`models.mdm.effects`); 0 = the model takes no effect vector."""
 
     def __post_init__(self) -> None:
         levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
@@ -251,48 +248,32 @@ class UNet(nn.Module):
                 width = widths[level - 1]
         self.norm = ChannelNorm(width)
         self.leave = nn.Conv2d(width, planes_out * area, 1)
-        stages = [*(s for level in self.down for s in level), self.middle, *(s for level in self.up for s in level)]  # type: ignore[attr-defined]
-        self.block_sides = [(stage.block.conv2.out_channels,) * 2 for stage in stages]
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
 
-    def forward(self, x: Tensor, t: Tensor, effect: tuple[Tensor, Tuning] | None = None) -> Tensor:
-        """`x` [B,T,planes_in,h,w], `t` i64[B] -> f32 [B,T,planes_out,h,w]. `effect`: what it adds to the embedding, [B,embed], and to
-        what the blocks state."""
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        """`x` [B,T,planes_in,h,w], `t` i64[B] -> f32 [B,T,planes_out,h,w]."""
         batch, frames = x.shape[:2]
         embedding = self.time(sinusoid(t, 64)) + self.label(sinusoid(torch.zeros_like(t), 64))
-        tuned = _untuned
-        if effect is not None:
-            embedding, tuned = embedding + effect[0], _in_turn(effect[1])
         embedding = functional.silu(embedding).repeat_interleave(frames, 0)
         h = functional.pixel_unshuffle(x.flatten(0, 1), self.patch)
         h = self.enter(h.contiguous(memory_format=torch.channels_last))
         skips = [h]
         for level, stages in enumerate(self.down):
             for stage in stages:
-                h = tuned(stage(h, embedding, frames))
+                h = stage(h, embedding, frames)
                 skips.append(h)
             if level < len(self.shrink):
                 h = self.shrink[level](h)
                 skips.append(h)
-        h = tuned(self.middle(h, embedding, frames))
+        h = self.middle(h, embedding, frames)
         for index, stages in enumerate(self.up):
             for stage in stages:
-                h = tuned(stage(torch.cat([h, skips.pop()], 1), embedding, frames))
+                h = stage(torch.cat([h, skips.pop()], 1), embedding, frames)
             if index < len(self.grow):
                 h = functional.pixel_shuffle(self.grow[index](h), 2).contiguous(memory_format=torch.channels_last)
         h = self.leave(functional.silu(self.norm(h)))
         return functional.pixel_shuffle(h.float(), self.patch).unflatten(0, (batch, frames))
-
-
-def _untuned(x: Tensor) -> Tensor:
-    return x
-
-
-def _in_turn(tuning: Tuning) -> Callable[[Tensor], Tensor]:
-    """What adds to the maps of a network's blocks, called once for each, what the effect's layers make of them."""
-    steps = tuning.steps()
-    return lambda x: x + next(steps).of(x)
 
 
 # refiner --------------------------------------------------------------------------------------------------------------
@@ -386,32 +367,21 @@ class CellNet(nn.Module):
         self.norm = ChannelNorm(fine)
         self.leave = nn.Conv2d(fine, outside, 1)
 
-    @property
-    def block_sides(self) -> list[tuple[int, int]]:
-        """Channels that an effect's layers read and add to: of every block, and of what comes out."""
-        outer, inner = (self.enter.out_channels,) * 2, (self.shrink.out_channels,) * 2
-        last = self.leave.in_channels, self.leave.out_channels
-        return [*(outer for _ in self.before), *(inner for _ in self.middle), *(outer for _ in self.after), last]
-
-    def pixels(self, planes: Tensor, frames: int, tuning: Tuning | None = None) -> Tensor:
-        """[N,inside,h,w] -> f32[N,outside/4,2h,2w]; `frames` neighbouring ones belong together. `tuning`: what an effect adds."""
-        steps = None if tuning is None else tuning.steps()
-        tuned = _untuned if steps is None else lambda x: x + next(steps).of(x)
+    def pixels(self, planes: Tensor, frames: int) -> Tensor:
+        """[N,inside,h,w] -> f32[N,outside/4,2h,2w]; `frames` neighbouring ones belong together."""
         planes = planes.contiguous(memory_format=torch.channels_last)
         x = self.enter(planes)
         del planes  # they are large
         for block in self.before:
-            x = tuned(block(x, frames))
+            x = block(x, frames)
         y = self.shrink(x)
         for block in self.middle:
-            y = tuned(block(y, frames))
+            y = block(y, frames)
         y = functional.pixel_shuffle(self.grow(y), 2)
         x = self.join(torch.cat([x, y], 1).contiguous(memory_format=torch.channels_last))
         for block in self.after:
-            x = tuned(block(x, frames))
-        x = functional.silu(self.norm(x))
-        out = self.leave(x) if steps is None else self.leave(x) + next(steps).of(x)
-        return functional.pixel_shuffle(out.float(), 2)
+            x = block(x, frames)
+        return functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
 
 
 class Refiner(CellNet):
@@ -451,10 +421,8 @@ class Refiner(CellNet):
             parts = [torch.full((size,), start) for size, start in zip(self.sizes, starts)]
             self.leave.bias.copy_(torch.cat(parts))  # type: ignore[union-attr]
 
-    def forward(
-        self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int, tuning: Tuning | None = None
-    ) -> Refined:
-        """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels. `tuning`: what an effect adds."""
+    def forward(self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+        """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels."""
         rgb, depth, scores = codec.decode_raw(latents)
         fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
         seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
@@ -462,7 +430,7 @@ class Refiner(CellNet):
                   shares(given.backdrop_ids)]  # fmt: skip
         if self.renders:
             planes += [*(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)), shares(given.render_ids)]
-        out = self.pixels(joined(planes, rgb.dtype), frames, tuning)
+        out = self.pixels(joined(planes, rgb.dtype), frames)
         parts = out.split([size // 4 for size in self.sizes], 1)
         more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[: len(self.SIZES)]
         if self.renders:

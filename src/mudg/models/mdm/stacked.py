@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from mudg.base import palette
-from mudg.base.effects import EFFECTS
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Condition
 from mudg.models.mdm.network import shares
@@ -32,7 +31,6 @@ class Stacked:
     ids: Tensor
     backdrop_ids: Tensor
     renders: RenderPlanes
-    effect: Tensor | None
 
     @classmethod
     def of(cls, batch: Sequence[Condition]) -> Stacked:
@@ -47,16 +45,7 @@ class Stacked:
             torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
             torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
             RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
-            _effects_of(batch),
         )
-
-
-def _effects_of(batch: Sequence[Condition]) -> Tensor | None:
-    """Effect vectors [B,8], zeros for a clip without one; None where none has any, or only zeros."""
-    if all(c.effect is None or not bool(c.effect.any()) for c in batch):
-        return None
-    nothing = torch.zeros(len(EFFECTS), device=batch[0].color.device)
-    return torch.stack([nothing if c.effect is None else c.effect for c in batch])
 
 
 def cell_means(mask: Tensor, factor: int) -> Tensor:

@@ -152,7 +152,7 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
     turn = torch.from_numpy(geometry.quaternion_from_matrix(geometry.invert(pose))).float().to(model.device)
     columns["means"][rows] = torch.from_numpy(local[inside].astype(np.float32)).to(model.device)
     columns["quats"][rows] = columns["quats"][rows] @ left_product_matrix(turn).T
-    if model.sh_degree > 0 and not model.harmonics_in_world:
+    if model.sh_degree > 0:
         box_from_world = harmonics.mixing(torch.from_numpy(pose[:3, :3].T.copy()), model.sh_degree).to(model.device)
         columns["sh_rest"][rows] = harmonics.turned(columns["sh_rest"][rows], box_from_world)
     owner = table.labels["node"].clone()

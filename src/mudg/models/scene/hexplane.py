@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from mudg.base import seeds
-from mudg.base.errors import InputError
 from mudg.base.types import View
 from mudg.core.hex_planes import TIME, PlaneSizes, look_up
 from mudg.core.table import Table
@@ -154,14 +153,7 @@ class HexPlaneNode(StaticNode):
 
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HexPlaneNode:
-        """Inverse of ``state``.
-
-        Raises:
-            InputError: of an earlier version, whose planes lie in another order.
-        """
-        if "gain" not in facts:
-            raise InputError("this field of place and time was fitted by an earlier version", where="nodes",
-                             remedy="fit the scene again, or render it with the version that fitted it")  # fmt: skip
+        """Inverse of ``state``."""
         sizes = PlaneSizes(**{name: int(facts[name]) for name in PlaneSizes.__dataclass_fields__})
         return cls(str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors), float(facts["gain"]))
 

@@ -66,8 +66,6 @@ class SceneModel:
         sh_degree: of the colour columns.
         facts: JSON values kept with the model (method, scene id, ...).
         colors: how the cameras of the log show the Gaussians' colours, which are common ones.
-        harmonics_in_world: whether ``sh_rest`` of objects is of directions in the world, as scenes were fitted before it was of
-            their own frame. Such colours do not turn with the object.
     """
 
     table: Table
@@ -77,7 +75,6 @@ class SceneModel:
     sh_degree: int
     facts: dict[str, Any] = field(default_factory=dict)
     colors: CameraColors = SAME_COLORS
-    harmonics_in_world: bool = False
     _counted: tuple[Tensor, list[int]] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -177,7 +174,7 @@ class SceneModel:
         tensors.setdefault("none", torch.zeros(1))
         values = {"nodes": nodes, "classes": list(self.classes), "sh_degree": self.sh_degree, "facts": self.facts}
         if self.sh_degree > 0:
-            values["harmonics"] = "world" if self.harmonics_in_world else "node"
+            values["harmonics"] = "node"  # in the frame of their object
         if self.colors.to_common:
             values["camera_colors"] = self.colors.record()
         return values, {"gaussians": self.table.state(), "nodes": tensors}
@@ -213,10 +210,11 @@ class SceneModel:
             raise InputError("the Gaussians have other classes than the scene", expected=f"{len(classes)} channels",
                 got=str(tuple(table["semantics"].shape)))  # fmt: skip
         colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
-        degree, axes = int(values["sh_degree"]), values.get("harmonics", "world")
-        if axes not in ("world", "node"):
-            raise InputError("unknown frame of a scene's spherical harmonics", where="harmonics", expected="node or world", got=str(axes))
-        return cls(table, tuple(nodes), sky, classes, degree, dict(values["facts"]), colors, degree > 0 and axes == "world")
+        degree = int(values["sh_degree"])
+        if degree > 0 and values.get("harmonics") != "node":
+            raise InputError("the scene's spherical harmonics are not in the frames of its objects", where="harmonics", expected="node",
+                             got=str(values.get("harmonics")), remedy="fit the scene again")  # fmt: skip
+        return cls(table, tuple(nodes), sky, classes, degree, dict(values["facts"]), colors)
 
 
 def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussians:
@@ -232,7 +230,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
     blocks = zip(*(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)))
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
     given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
-    if model.sh_degree > 0 and not model.harmonics_in_world:
+    if model.sh_degree > 0:
         all_rows = replace(all_rows, sh_rest=table["sh_rest"])
         given = [replace(rows, sh_rest=rest) for rows, rest in zip(given, table["sh_rest"].split(counts))]
     found = []
@@ -252,7 +250,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
         scales=torch.exp(table["log_scales"]),
         opacity=column("opacity"),
         sh=column("sh_dc"),
-        sh_rest=None if model.sh_degree == 0 else table["sh_rest"] if model.harmonics_in_world else column("sh_rest"),
+        sh_rest=None if model.sh_degree == 0 else column("sh_rest"),
         extra=table["semantics"] if semantics and model.classes else None,
         node=table.labels["node"],
     )

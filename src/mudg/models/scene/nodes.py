@@ -314,12 +314,8 @@ class RigidNode:
 
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
-        """Inverse of ``state``. Scenes fitted before shift and yaw were two columns are read too."""
+        """Inverse of ``state``."""
         offsets = {key.removeprefix("offsets."): value for key, value in tensors.items() if key.startswith("offsets.")}
-        if "column.offsets" in offsets:
-            offsets = {f"{part}.{name}": value[:, cut] for part in ("column", "moment1", "moment2")
-                       if (value := offsets.get(f"{part}.offsets")) is not None
-                       for name, cut in (("shift", slice(0, 3)), ("yaw", 3))}  # fmt: skip
         name, table = str(facts["name"]), Table.from_state(offsets)
         times, poses = tensors["times_s"].numpy(), tensors["world_from_object"].numpy()
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any():

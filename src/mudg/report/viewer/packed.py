@@ -119,10 +119,7 @@ def pack_scene(
         "antialias": bool(_drawing(model).get("antialias", False)), "nodes": nodes, "deform_step": DEFORM_STEP_M,
     }  # fmt: skip
     if model.sh_degree:
-        facts |= {
-            "harmonic_step": _harmonic_step(columns["sh_rest"], layout),
-            "harmonics_in_world": model.harmonics_in_world,
-        }
+        facts["harmonic_step"] = _harmonic_step(columns["sh_rest"], layout)
     if model.sky is not None:
         panorama = model.sky.table["panorama"].detach()[0].numpy()
         moving["sky"] = to_u8(panorama.transpose(1, 2, 0))

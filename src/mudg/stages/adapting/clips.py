@@ -2,7 +2,7 @@
 
 The truth of a clip are photographs, and depth where a sweep measured it. Elsewhere depth and all classes are what the model that is
 adapted makes itself of the same condition: the log shows colours, but nobody knows what stands above its LiDAR, and guessed labels
-must not be learned as truth. So are colours where a lesson leaves a camera out and no other one saw them.
+must not be learned as truth.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages.adapting.cameras import Witnesses, others_of, recolored
 from mudg.stages.adapting.lessons import LearntLog, Lesson, fit_lesson, lessons_of
 from mudg.stages.config import AdaptConfig
 from mudg.stages.fitting.planes import render_planes
@@ -40,14 +39,13 @@ Plan = list[tuple[int, Lesson, tuple[str, ...]]]
 
 
 def plan_clips(lessons: list[Lesson], config: AdaptConfig) -> Plan:
-    """All clips: those to learn from have numbers from 0, those for scoring from `HELD_OUT`; a block serves for one only. Lessons that
-    leave a camera out have none to score: they know the truth of a part of the pixels alone."""
+    """All clips: those to learn from have numbers from 0, those for scoring from `HELD_OUT`; a block serves for one only."""
     plan: Plan = []
     counts = {False: 0, True: 0}
     for lesson in lessons:
         for block, frames in lesson.truth:
             scored = block % config.held_out_every == config.held_out_every // 2
-            if len(frames) < config.block or (scored and lesson.left_out):
+            if len(frames) < config.block:
                 continue
             plan.append((counts[scored] + (HELD_OUT if scored else 0), lesson, frames))
             counts[scored] += 1
@@ -95,10 +93,6 @@ class ClipMaker:
         ]
         self._fitted = load_model(folder / "fit")
         self._sources: dict[int, WarpSource] = {}
-        self._witnesses = None
-        if lesson.left_out:
-            self._witnesses = Witnesses.of(self._scene, others_of(self._scene, lesson.left_out), load_model(log.fitted))
-            self._whole_colors = read_fused(log.fused).colors
         size = (log.width_px, log.height_px)
         self._rules = ConditionRules(*size, *(log.scale * side for side in size))
 
@@ -125,10 +119,6 @@ class ClipMaker:
     def _clip(self, condition: Condition, images: list, made: GeneratedClip) -> Clip:
         rgb = torch.stack([image_tensor(resize_area(i, v.camera.width, v.camera.height)) for i, v in zip(images, condition.views)])
         depth, known = (torch.stack(parts) for parts in zip(*(self._measured(view) for view in condition.views)))
-        if self._witnesses is not None:
-            left_out, shown = self._lesson.left_out, self._photos[0].view.camera.name
-            rgb = torch.stack([recolored(image, left_out, shown, self._whole_colors, self._cloud.colors) for image in rgb])
-            rgb = torch.where(torch.stack([self._witnesses.see(view) for view in condition.views])[:, None], rgb, made.rgb)
         return Clip(condition, rgb, torch.where(known, depth, made.depth), torch.ones_like(known), made.semantics)
 
     def _measured(self, view: View) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,7 +8,6 @@ A lesson is a drive that shows some photographs and not others:
   not show there is rendered. These pictures are taken for a recorded drive, and the real photographs, now beside its path, are the
   truth. The way there goes by the depth of the first fit, the way back by that of another, which is fitted to the carried pictures alone,
   so holes, splinters and wrong parallax are those of a lateral shift.
-* **camera**: all photographs of one camera are left out and are the truth, where others saw what they show (`cameras.py`).
 
 A short fit to what a lesson shows gives the renders of its conditions, as `synthesize` would have them.
 """
@@ -46,14 +45,12 @@ class Lesson:
         shift_m: how far the shown pictures were carried to the left; 0 = they are photographs.
         shown: ids of the frames that are shown. truth: blocks of ids of the frames to be generated, one camera and at most
             `AdaptConfig.block` frames each, with the number of the block along the log.
-        left_out: the camera whose photographs are the truth and are not shown; empty if a lesson leaves out no camera.
     """
 
     name: str
     shift_m: float
     shown: tuple[str, ...]
     truth: tuple[tuple[int, tuple[str, ...]], ...]
-    left_out: str = ""
 
 
 @dataclass(frozen=True)

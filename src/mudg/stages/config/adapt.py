@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -16,6 +17,8 @@ class AdaptConfig:
     """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from where other
     photographs of the log were taken or might have been taken."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"cameras_left_out": ("block", [])}
+
     model: str = "embedded"
     """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must use renders."""
     cameras: tuple[str, ...] = ("front",)
@@ -24,9 +27,6 @@ class AdaptConfig:
     """Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate the photographs."""
     gaps: bool = True
     """Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the other half."""
-    cameras_left_out: tuple[str, ...] = ()
-    """Cameras that give one more lesson each: to generate their photographs from those of all other cameras alone, at the pixels that
-    these saw (empty = no such lesson)."""
     block: int = Field(default=4, ge=1)
     """Frames per training clip, and consecutive frames left out together."""
     held_out_every: int = Field(default=4, ge=2)

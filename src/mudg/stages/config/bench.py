@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -19,8 +18,6 @@ from mudg.stages.config.views import ScoreConfig
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class BenchOwn:
     """The settings of ``mudg bench`` without those of the steps that it takes."""
-
-    MOVED: ClassVar[Mapping[str, str | None]] = {"ablation_steps": None, "ablation_cities": None}
 
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or

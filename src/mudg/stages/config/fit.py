@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -187,24 +186,6 @@ class VirtualConfig:
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FitConfig:
     """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
-
-    MOVED: ClassVar[Mapping[str, str | None]] = {
-        "initial_gaussians": "start.gaussians", "voxel_m": "start.voxel_m", "far_m": "start.far_m", "densify": "densify.kind",
-        "max_gaussians": "densify.max_gaussians", "longest_to_middle": "densify.longest_to_middle", "deformable": "objects.deformable",
-        "mirror_start": "objects.mirror_start", "learn_poses": "poses.learn", "pose_start": "poses.start", "pose_rounds": "poses.rounds",
-        "exposure": "appearance.exposure", "exposure_weight": "appearance.exposure_weight", "learn_cameras": "appearance.cameras",
-        "virtual_appearance": "appearance.virtual", "lpips_weights": "virtual.lpips_weights",
-        **{name: f"loss.{name}" for name in (
-            "ssim_weight", "lidar_weight", "sky_weight", "semantic_weight", "semantic_every", "object_weight", "opacity_weight",
-            "scale_weight",
-        )},
-        **{f"virtual_{name}": f"virtual.{name}" for name in (
-            "probability", "beside", "start", "stop", "gaussians", "densify", "confidence_power", "color_weight", "ssim_weight",
-            "perceptual_weight", "perception", "depth_weight", "lidar_weight", "semantic_weight",
-        )},
-        **dict.fromkeys(("selective_adam", "color_terms", "mirror_probability", "outlier_deviations", "virtual_grow",
-                         "virtual_seen_weight")),
-    }  # fmt: skip
 
     method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"] = "mudg_s"
     """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by

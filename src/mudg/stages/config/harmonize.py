@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -13,6 +14,8 @@ from mudg.base.config import STRICT
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class HarmonizeConfig:
     """Where and how far a diffusion model changes the views of an edited scene."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weather_any_model": ("changed_above", False)}
 
     on: bool = False
     """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
@@ -27,11 +30,8 @@ class HarmonizeConfig:
     objects: float = Field(default=0.0, ge=0, le=1)
     """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
     weather: float = Field(default=0.0, ge=0, le=1)
-    """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it. For models that take
-    an effect vector, unless ``weather_any_model`` is set, and for published-type models, whose points and reference are edited."""
-    weather_any_model: bool = False
-    """Let a model that takes no effect vector, as the shipped ones, correct weather and light, too: it repairs the edited render without
-    being told which weather it is to have."""
+    """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it. For published-type
+    models alone, whose points and reference are edited."""
     changed_above: float = Field(default=4 / 255, ge=0, le=1)
     """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as they are."""
     feather_px: int = Field(default=3, ge=0)

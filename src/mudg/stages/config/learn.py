@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -18,6 +19,7 @@ class LearnData:
     """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
 
     STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weathers": ("textures", 0), "effect_dropout": ("textures", 0.1)}
     """Settings that may be addresses of an object store."""
     width: int = Field(default=192, ge=32)
     """Width of the training images in pixels."""
@@ -62,11 +64,6 @@ class LearnData:
     condition: Literal["full", "freevs"] = "full"
     """Generated cities: what the model is given. freevs: as FreeVS, coloured LiDAR points of two frames before and after each view, without
     depth, recorded images, classes and renders; use the model with `mudg synthesize --condition freevs`."""
-    weathers: int = Field(default=0, ge=0)
-    """Generated cities, with renders: use every clip this often, each time edited to other weather or light, with the city generated in
-    that weather as truth (0 = as it is). For models that take an effect vector (`--network.effects`)."""
-    effect_dropout: float = Field(default=0.1, ge=0, lt=1)
-    """Share of the clips in other weather that are trained without their effect vector."""
     textures: str = ""
     """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use (empty =
     none)."""
@@ -99,6 +96,8 @@ class LearnData:
 class LearnNetwork:
     """Shape of the denoising network and of the refiner behind it."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"effects": ("", 0)}
+
     widths: tuple[int, ...] = (64, 128, 224)
     """Channels of the network at each resolution level."""
     blocks: tuple[int, ...] = (1, 1, 2)
@@ -119,9 +118,6 @@ class LearnNetwork:
     """Channels of the finisher, which brings clips to the camera's size, at half and at a quarter of that size (empty = no finisher)."""
     finish_blocks: tuple[int, ...] = (2, 2)
     """Residual blocks of the finisher at each level."""
-    effects: int = Field(default=0, ge=0)
-    """Channels of the layers that an effect vector, weather and light in eight numbers, adds to the network (0 = none, or as --start
-    has them)."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -228,27 +224,6 @@ class LearnCompute:
 class LearnConfig:
     """Train a multi-modal diffusion model on generated cities or on recorded logs."""
 
-    MOVED: ClassVar[dict[str, str | None]] = {
-        **{name: f"data.{name}" for name in (
-            "width", "height", "window", "clips", "augment", "reference_dropout", "cities", "first_cities", "all_cities_at",
-            "clips_per_city", "held_out", "scenes", "stride", "frame_step", "held_out_every", "label_confidence",
-        )},
-        **{name: f"network.{name}" for name in (
-            "widths", "blocks", "spatial_attention", "temporal_attention", "patch", "refine_widths", "refine_blocks",
-        )},
-        **{name: f"optimizer.{name}" for name in (
-            "batch_frames", "full_window_share", "lr", "warmup_steps", "decay_share", "last_lr_share", "weight_decay", "clip_norm",
-            "average_decay",
-        )},
-        **{name: f"compute.{name}" for name in (
-            "device", "parallel", "accumulate", "recompute", "workers", "checkpoint_every", "log_every", "tensorboard",
-        )},
-        "scene_cameras": "data.cameras", "codec_steps": "codec.steps", "codec_batch": "codec.batch",
-        "codec_fit_batches": "codec.fit_batches", "codec_lr": None, "beta1": "optimizer.betas", "beta2": "optimizer.betas",
-        "balance": "loss.class_balance", "refined_share": "loss.refined_share", "sample_every": "score.every",
-        "watched": "score.watched", "sample_steps": "score.steps", "score_steps": "score.steps", "cache_latents": None,
-    }  # fmt: skip
-
     seed: int = 0
     """Seed of the cities, the initial weights and all other random numbers."""
     start: str = ""
@@ -256,10 +231,9 @@ class LearnConfig:
     scratch)."""
     steps: int = Field(default=2800, ge=1)
     """Training steps of the network."""
-    frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser", "all_but_effects"] = "nothing"
+    frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
     """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that
-    mix frames. denoiser: train the refiner only. all_but_effects: train only what an effect vector changes (`--network.effects`);
-    without a vector the model stays what --start is, bit for bit."""
+    mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
     threads: int = Field(default=1, ge=1)

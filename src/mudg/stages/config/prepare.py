@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -86,8 +86,6 @@ class AnnotateConfig:
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FuseConfig:
     """Fuse sweeps and images into a static coloured point cloud and one cloud per dynamic object."""
-
-    MOVED: ClassVar[dict[str, str | None]] = {"colour_from_held_out": "color_from_held_out"}
 
     voxel_m: float = Field(default=0.0, ge=0)
     """Keep one point per voxel of this size, in metres (0 = keep all)."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
-
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -72,14 +69,3 @@ class RadianceConfig:
     """Weight of the squared shadow."""
     cycle_weight: float = Field(default=0.01, ge=0)
     """Weight of the flow's consistency there and back."""
-
-
-PUBLISHED_EMERNERF: Final[Mapping[str, Any]] = {
-    "method": "emernerf", "iterations": 25_000, "checkpoint_every": 2500, "preview_every": 2500,
-    "radiance.rays": 8192, "radiance.lidar_rays": 8192, "radiance.proposal_samples": (128, 64), "radiance.samples": 64,
-    "radiance.static_grid": (10, 4, 16, 8192, 20), "radiance.dynamic_grid": (10, 4, 32, 8192, 18),
-    "radiance.flow_grid": (10, 4, 16, 4096, 18), "radiance.first_proposal_grid": (8, 1, 16, 512, 20),
-    "radiance.second_proposal_grid": (8, 1, 16, 2048, 20), "radiance.width": 64, "radiance.proposal_width": 64,
-    "radiance.sight_least_m": 2.5, "radiance.dynamic_weight": 0.01,
-}  # fmt: skip
-"""The published sizes and weights, over the defaults of ``FitConfig``."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -15,8 +14,6 @@ from mudg.base.devices import DeviceName
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
-
-    MOVED: ClassVar[Mapping[str, str | None]] = {"start": None, "strength": None}
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""

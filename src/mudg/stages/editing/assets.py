@@ -119,9 +119,6 @@ def read_asset(path: Path) -> Asset:
     if text is None:
         raise InputError("this file is no asset", where=str(path), expected="a file written by `mudg asset export`")
     facts = store.parse_json(text, f"{path}: header")
-    if isinstance(facts, dict) and facts.get("schema") == 1:
-        raise InputError("this asset was written by an older version", where=str(path), expected="schema 2, with the light of its street",
-            got="schema 1", remedy="export it again with `mudg asset export`")  # fmt: skip
     header = parse_record(AssetHeader, facts, f"{path}: header: ")
     count = len(arrays["means"]) if "means" in arrays else 0
     wanted = {**{key: (count, *shape) for key, shape in _SHAPES.items()}, "class_ids": (count,)}

@@ -17,6 +17,7 @@ import numpy as np
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError, nearest
 from mudg.base.types import PointCloud, Scene, View
+from mudg.base.weather_settings import WeatherSettings
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion
 from mudg.core.ground import HeightMap
@@ -53,7 +54,6 @@ class EditSources:
     """Whether the street is closed behind what leaves its place, where a script does not say."""
 
 
-VEHICLE_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "trailer"})
 SAME_PLACE_M: Final = 1e-4
 MOVING_M: Final = 1.0
 """An object moves if its box gets farther than this from its first place."""
@@ -154,6 +154,12 @@ class EditPlan:
     def touched(self) -> tuple[str, ...]:
         """Ids of actors whose path or looks are new."""
         return tuple(dict.fromkeys([*(name for name in self.changes if name in self.after.actors), *self.inserted]))
+
+    @property
+    def weather_of_beams(self) -> WeatherSettings | None:
+        """Weather that LiDAR beams go through: with fog or rain, else None."""
+        weather = self.conditions.get("weather")
+        return weather if weather is not None and (weather.fog or weather.rain) else None
 
 
 _DISPLACING: Final = frozenset({"move", "stop", "speed", "lane_change", "path"})

@@ -7,7 +7,7 @@ nothing came back (the sky) are not known, so an object in front of the sky gets
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -31,22 +31,24 @@ Rows = NDArray[np.bool_]
 @dataclass(frozen=True, slots=True)
 class SweptCounts:
     """What became of returns: ``cleared`` met an object that is gone; of these ``on_ground`` meet the ground behind it; ``on_objects``
-    meet an object at its new place, of which ``hidden`` had met something behind it; ``unknown`` do not come back."""
+    meet an object at its new place, of which ``hidden`` had met something behind it; ``unknown`` do not come back.
+    Of those that do, ``lost`` do not in fog or rain, and ``droplets`` come from fog."""
 
     cleared: int = 0
     on_ground: int = 0
     on_objects: int = 0
     hidden: int = 0
     unknown: int = 0
+    lost: int = 0
+    droplets: int = 0
 
     def plus(self, other: SweptCounts) -> SweptCounts:
         """Both together."""
-        mine, its = self.record(), other.record()
-        return SweptCounts(**{name: mine[name] + its[name] for name in mine})
+        return SweptCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     def record(self) -> dict[str, int]:
-        """As JSON values."""
-        return {name: getattr(self, name) for name in ("cleared", "on_ground", "on_objects", "hidden", "unknown")}
+        """As JSON values; those of weather where there is some."""
+        return {name: value for name, value in asdict(self).items() if value or name not in ("lost", "droplets")}
 
 
 def edited_points(points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud) -> tuple[SweepPoints, SweptCounts]:

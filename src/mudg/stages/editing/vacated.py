@@ -63,7 +63,7 @@ def drive_of_edits(script: EditScript, scene: Scene, cloud: FusedCloud, model: S
         InputError: something in the script that cannot be done here.
     """
     if told and conditions_of(script.canonical()) is not None:
-        log.info("generated views show no weather and light (that takes --fitted and a model with an effect vector); `mudg render` does")
+        log.info("generated views show no weather and light (that takes --fitted and a published-type model); `mudg render` does")
     if model is not None:
         drive = carry_out(script, model, scene, cloud)
         return DriveOfEdits(drive.plan, drive.scene or scene, cleared_cloud(drive.cloud or cloud, drive.plan), drive.model(model))

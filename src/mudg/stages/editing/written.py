@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mudg.base import log
+from mudg.base import log, seeds
 from mudg.base.palette import DYNAMIC_IDS, ID
 from mudg.base.types import Frame, FusedCloud, Observation, Scene
 from mudg.core.pictures import to_bytes
+from mudg.core.weather.lidar import SOFT, sweep_in_weather
 from mudg.data.scene import SceneWriter, read_image, read_label, read_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config.edit import EditConfig
 from mudg.stages.editing.plan import EditPlan
 from mudg.stages.editing.swept import SweptCounts, edited_points
+from mudg.stages.editing.weathered import SEED
 from mudg.stages.fitting.rendering import raster_of, render_view
 
 NOTE: Final = "edited: parts of the images are renders of a fitted scene"
@@ -85,8 +87,12 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
     with SceneWriter(root, scene.id, source) as writer:
         for camera in scene.cameras.values():
             writer.add_camera(camera)
-        for sweep in scene.sweeps if drive.plan.background is None else ():  # another street was not measured from here
+        for number, sweep in enumerate(scene.sweeps if drive.plan.background is None else ()):  # another street was not measured from here
             points, became = edited_points(read_points(scene, sweep), sweep, drive.plan, drive.cloud)
+            if drive.plan.weather_of_beams is not None:
+                there, seed = len(points.xyz), seeds.key(SEED, number, "LiDAR in weather")
+                points, kinds = sweep_in_weather(points, drive.plan.weather_of_beams, seed)
+                became = replace(became, lost=there - len(kinds), droplets=int((kinds == SOFT).sum()))
             counts = counts.plus(became)
             writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
         for track in edited.tracks:

@@ -34,8 +34,7 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
     """A fitted scene in world axes.
 
     Args:
-        time_s: at which a background that changes with time, which no file holds, is taken; and colours of objects that do not turn with
-            them. names: of nodes to keep (none: all).
+        time_s: at which a background that changes with time, which no file holds, is taken. names: of nodes to keep (none: all).
 
     Raises:
         UsageError: a node that the scene does not have.
@@ -45,28 +44,16 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
     if unknown:
         raise UsageError(f"the fitted scene has no node {unknown[0]!r}", where="--nodes", expected=", ".join(there))
     classes, made = classes_of_rows(model), list[SplatNode]()
-    in_world = model.sh_degree > 0 and model.harmonics_in_world  # not of the objects' own frames
     for index, node in enumerate(model.nodes):
         rows = (model.table.labels["node"] == index).nonzero()[:, 0]
         if (names and node.name not in names) or (index and not len(rows)):
             continue
         ids = classes[rows.cpu().numpy()]
         known = None if not model.classes else np.where(ids < 0, UNLABELLED, ids).astype(np.uint8)
-        sh = _sh(model, rows)
-        if in_world and isinstance(node, RigidNode):
-            sh = harmonics.rotated(sh, node_turn(node, time_s).T)
-        made.append(_node(node, _given(model, rows), sh, known, time_s))
+        made.append(_node(node, _given(model, rows), _sh(model, rows), known, time_s))
     facts = {key: model.facts[key] for key in ("method", "scene", "drawing") if key in model.facts}
-    if in_world:
-        facts["harmonics"] = "world"
     name = str(model.facts.get("scene", "scene"))
     return SplatScene(name, tuple(made), sky=None if model.sky is None else sky_picture(model.sky), facts=facts)
-
-
-def node_turn(node: RigidNode, time_s: float) -> NDArray[np.float64]:
-    """Rotation f64[3, 3] of an object at a time, or at the end of its path that is nearest."""
-    pose = node.pose_matrix(float(np.clip(time_s, node.times_s[0], node.times_s[-1])))
-    return np.eye(3) if pose is None else pose[:3, :3]
 
 
 def _given(model: SceneModel, rows: Tensor) -> tuple[NodeRows, Tensor]:

@@ -60,7 +60,6 @@ def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.Cit
         data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone,
         realism=data.realism, textures=data.textures,
         fitted=data.renders and not points_alone, near_points=data.condition == "freevs",
-        weathers=data.weathers if data.renders and not points_alone else 0,
         log_frames=data.log_frames, side_cameras=data.side_cameras, fit_steps=data.fit_steps,
     )
 

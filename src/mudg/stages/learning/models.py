@@ -70,7 +70,7 @@ def kind_of(model: nn.Module) -> ModelKind:
 
 
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
-    """The model to train, and which of its parts ("codec", "refiner", "finisher", "effects") have no weights yet.
+    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
 
     With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
     ask for them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
@@ -83,7 +83,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     wanted = model_config(config)
     can_grow = config.data.renders and not config.data.scenes
     if not config.start:
-        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher", "effects"}
+        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
     if is_published(config.start):
         if not _network_is_default(config):
             raise UsageError("the shape of a published-type network cannot be changed", where="--start",
@@ -93,9 +93,6 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     if before.config.window != config.data.window:
         log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
     wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
-    wanted = replace(wanted, effects=wanted.effects or before.config.effects)
-    if config.frozen == "all_but_effects":  # the rest of the model stays what it is
-        wanted = replace(wanted, window=before.config.window, area_px=before.config.area_px)
     resized = model_of_window(before, wanted.window, wanted.area_px)
     if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
         log.info("learn: the network has the shape of --start")
@@ -103,7 +100,6 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     if wanted == resized.config:
         return resized, set()
     grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
-    grown |= {"effects"} if wanted.effects != before.config.effects else set()
     return extended(resized, wanted), grown
 
 
@@ -138,26 +134,6 @@ def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
     log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
 
 
-def check_effects(model: Model, fresh: set[str], config: LearnConfig) -> None:
-    """UsageError unless effects and clips in other weather go together: what learns from such clips takes an effect vector, and what is
-    new, or alone trained, has such clips to learn from."""
-    effects, weathers = model.effects if isinstance(model, MDM) else None, config.data.weathers
-    if weathers and effects is None:
-        raise UsageError("clips in other weather need a model that takes an effect vector", where="--data.weathers", got=str(weathers),
-                         remedy="give --network.effects 16, or leave it out")  # fmt: skip
-    if weathers and (config.data.scenes or not config.data.renders or config.compute.parallel == "fsdp"):
-        raise UsageError("clips in other weather are made of generated cities with renders, and learned in one process or with ddp",
-                         where="--data.weathers", got=str(weathers), remedy="leave it out")  # fmt: skip
-    if effects is not None and not weathers and ("effects" in fresh or config.frozen == "all_but_effects"):
-        raise UsageError("effects are learned from clips in other weather", where="--data.weathers", got="0", expected="1 or more")
-
-
-def hold_effects(model: Model, weathers: int) -> None:
-    """Let the effects keep their weights if no clip is in other weather."""
-    if isinstance(model, MDM) and model.effects is not None and not weathers:
-        model.effects.requires_grad_(False)
-
-
 def _network_is_default(config: LearnConfig) -> bool:
     """Whether the settings leave the network as it is by default."""
     default = LearnConfig(data=config.data)
@@ -185,11 +161,6 @@ def freeze(model: Model, what: str) -> int:
         names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
         if not isinstance(model, MDM) or model.refiner is None:
             raise UsageError("without a refiner nothing is left to train", where="--frozen", got=what)
-    elif what == "all_but_effects":
-        if not isinstance(model, MDM) or model.effects is None:
-            raise UsageError("the model takes no effect vector, so nothing is left to train", where="--frozen", got=what,
-                             remedy="give --network.effects 16")  # fmt: skip
-        names = {name for name, _ in model.trained_part().named_parameters() if not name.startswith(mdm_files.EFFECTS_PREFIX)}
     else:
         names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
     count = 0

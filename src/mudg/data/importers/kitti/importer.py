@@ -30,7 +30,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log, store
+from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
@@ -42,7 +42,6 @@ from mudg.data.importers.kitti import LICENCE
 from mudg.data.importers.kitti import boxes as kitti_boxes
 from mudg.data.importers.kitti import poses as kitti_poses
 from mudg.data.importers.kitti.calib import KittiCalibration, read_calibration_day, read_calibration_text
-from mudg.data.importers.kitti.info import import_info_frame
 from mudg.data.importers.kitti.scans import SENSOR, TURN_PERIOD_S, read_scan, untwist_scan
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
@@ -108,16 +107,8 @@ class _VeloMotion:
 
 
 def looks_like_kitti(source: Path) -> bool:
-    """Whether ``source`` is the folder of a KITTI drive, sequence, training set or single frame."""
-    if not source.is_dir():
-        return False
-    if any((source / name).is_dir() for name in ("image_02", "image_2", "image_00", "velodyne_points")):
-        return True
-    record = source / "info.json"
-    if not record.is_file() or not any(path.suffix == ".bin" for path in source.iterdir()):
-        return False
-    with store.open_file(record) as handle:
-        return b'"CAM2"' in handle.read(1 << 16)
+    """Whether ``source`` is the folder of a KITTI drive, sequence or training set."""
+    return any((source / name).is_dir() for name in ("image_02", "image_2", "image_00", "velodyne_points"))
 
 
 def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
@@ -129,8 +120,6 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("KITTI folder does not exist", where=str(source), expected="a folder")
-    if (source / "info.json").is_file() and not any((source / name).is_dir() for name in ("image_02", "image_2")):
-        return import_info_frame(source, out, options)
     files = find_files(source, options)
     stamps = _read_stamps(files, options)
     frames = _choose_frames(files, stamps, options)

@@ -37,7 +37,6 @@ from mudg.data.importers.box_tracks import BoxTracks
 from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.nuscenes import tables
-from mudg.data.importers.nuscenes.info import import_info_frame, looks_like_info_frame
 from mudg.data.importers.nuscenes.sensors import CAMERAS, LICENCE, SENSOR, camera_from_intrinsics, read_scan
 from mudg.data.importers.options import ImportOptions
 
@@ -67,15 +66,15 @@ _WITH_RIDER: Final = "cycle.with_rider"
 
 
 def looks_like_nuscenes(source: Path) -> bool:
-    """Whether a folder holds nuScenes tables, or is a table folder, or holds one frame's ``info.json``."""
-    return bool(_releases(source)) or looks_like_info_frame(source)
+    """Whether a folder holds nuScenes tables, or is a table folder."""
+    return bool(_releases(source))
 
 
 def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one scene of a nuScenes release into the scene directory ``out``; see the module text for what is read.
 
     Args:
-        source: the release's root, its table folder, or a folder with one frame and its ``info.json``.
+        source: the release's root, or its table folder.
         options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie side
             by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by default.
 
@@ -88,7 +87,9 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     layout.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
-        return import_info_frame(source, out, options)
+        raise InputError("no nuScenes tables found", where=str(source), got=layout.folder_contents(source),
+            expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
+            remedy="give the folder that holds v1.0-*, samples and sweeps")  # fmt: skip
     return drive_log.write_log(read_log(releases, options), out, options)
 
 
