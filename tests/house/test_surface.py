@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import json
 import os
 import re
@@ -28,11 +30,18 @@ def frozen(name: str, now: object) -> object:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def help_text(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stopped:
+def help_text(verb: str) -> str:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), pytest.raises(SystemExit) as stopped:
         flags.parse(verb, ["--help-all" if verb in flags.CHAINS else "--help"], "summary")
     assert stopped.value.code == 0
-    return capsys.readouterr().out
+    return printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def help_texts() -> dict[str, str]:
+    """Every verb's whole help."""
+    return {verb: help_text(verb) for verb in cli.VERBS}
 
 
 def test_public_names_are_frozen() -> None:
@@ -43,25 +52,24 @@ def test_public_names_are_frozen() -> None:
     assert set(now) <= set(dir(mudg))
 
 
-def test_flags_are_frozen(capsys: pytest.CaptureFixture[str]) -> None:
-    now = {verb: sorted(set(re.findall(r"--[a-z][\w.-]*", help_text(verb, capsys)))) for verb in cli.VERBS}
+def test_flags_are_frozen(help_texts: dict[str, str]) -> None:
+    now = {verb: sorted(set(re.findall(r"--[a-z][\w.-]*", text))) for verb, text in help_texts.items()}
     assert now == frozen("cli.json", now)
 
 
-def test_every_verb_has_flags_and_every_flag_an_explanation(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_has_flags_and_every_flag_an_explanation(help_texts: dict[str, str]) -> None:
     assert set(cli.VERBS) == set(flags.FLAGS)
     listed = [name for _, names in cli.SECTIONS for name in names]
     assert sorted(listed) == sorted(cli.VERBS)
-    for verb in cli.VERBS:
-        text = help_text(verb, capsys)
+    for verb, text in help_texts.items():
         assert "(default:" in text
         assert "usage: mudg " + verb in text
 
 
-def test_every_field_has_a_text(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.usefixtures("help_texts")
+def test_every_field_has_a_text() -> None:
     bare = []
     for verb, kind in flags.FLAGS.items():
-        help_text(verb, capsys)
         todo = [(verb, kind)]
         while todo:
             name, of = todo.pop()
@@ -71,17 +79,15 @@ def test_every_field_has_a_text(capsys: pytest.CaptureFixture[str]) -> None:
     assert not bare
 
 
-def test_help_reads_no_source_class_by_class(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_help_reads_no_source_class_by_class(monkeypatch: pytest.MonkeyPatch) -> None:
     """What tyro does for a field without a text: it parses the module anew for every class, which took longer than all else."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("the source of a class was asked for")
 
     monkeypatch.setattr("inspect.getsource", refuse)
-    assert "Optimisation steps" in help_text("fit", capsys)
-    assert "Hold out every n-th frame" in help_text("run", capsys)
+    assert "Optimisation steps" in help_text("fit")
+    assert "Hold out every n-th frame" in help_text("run")
 
 
 def test_the_help_of_a_chain_is_short_and_says_where_the_rest_is(capsys: pytest.CaptureFixture[str]) -> None:
