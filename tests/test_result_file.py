@@ -261,14 +261,15 @@ def forked(work: Callable[[], int], go: Path) -> int:
 
 def test_two_exports_to_one_file_at_a_time(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader never sees a file with another's description, and only one of the two writes."""
-    out, go, slow = tmp_path / "a.ply", tmp_path / "go", tmp_path / "slow"
+    out, go, slow, end = tmp_path / "a.ply", *(tmp_path / name for name in ("go", "slow", "end"))
     write = store.atomic_write
 
     def slowly(path: Path, content: bytes) -> None:
         write(path, content)
         if path.suffix == ".ply":
             slow.touch()
-            time.sleep(0.6)
+            while not end.exists():
+                time.sleep(0.005)
 
     with monkeypatch.context() as patched:
         patched.setattr(store, "atomic_write", slowly)
@@ -278,10 +279,11 @@ def test_two_exports_to_one_file_at_a_time(toy: Path, tmp_path: Path, monkeypatc
         time.sleep(0.005)
     assert command("ply", toy, tmp_path, "--time-s 0.2")() == 5
     assert command("ply", toy, tmp_path, "--time-s 0.2 --overwrite")() == 5
+    end.touch()
     assert os.waitstatus_to_exitcode(os.waitpid(first, 0)[1]) == 0
     assert json.loads((tmp_path / "a.ply.json").read_text())["time_s"] != 0.2
     pair(out)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.ply", "a.ply.json", "go", "slow"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.ply", "a.ply.json", "go", "slow", "end"}
 
 
 def test_readers_see_pairs_while_files_are_replaced(toy: Path, tmp_path: Path) -> None:
