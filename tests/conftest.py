@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import socket
 import sys
@@ -24,6 +25,11 @@ settings.register_profile(
 settings.load_profile("mudg")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish() -> None:
+    """What collecting has made stays to the end: the garbage collector need not look at it again."""
+    gc.freeze()
 
 
 def pytest_report_header() -> list[str]:
@@ -77,6 +83,14 @@ def _no_network() -> Iterator[None]:
     socket.socket.connect = guarded  # type: ignore[method-assign, assignment]
     yield
     socket.socket.connect = connect  # type: ignore[method-assign]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _no_waiting_for_the_disk() -> Iterator[None]:
+    """No test cuts the power: what the system has taken is read back, also by other processes and after a kill."""
+    fsync, os.fsync = os.fsync, lambda _fd: None
+    yield
+    os.fsync = fsync
 
 
 @pytest.fixture(autouse=True)

@@ -7,9 +7,11 @@ device. What it cannot tell: kernels that exist only there, speed, memory, race 
 
 from __future__ import annotations
 
+import os
 import traceback
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch.utils import _pytree as pytree
@@ -18,6 +20,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mudg.base import devices
 
 NAME = "pretend"
+PACKAGE = f"{Path(devices.__file__).parents[1]}{os.sep}"
 
 
 _LIBRARIES: list[torch.library.Library] = []
@@ -149,8 +152,8 @@ def transfers():
 
 def _note_transfer(way: str, values: int) -> None:
     if TRANSFERS:
-        frames = [f for f in traceback.extract_stack() if "/mudg/" in f.filename]
-        where = f"{frames[-1].filename.rpartition('/mudg/')[2]}:{frames[-1].name}" if frames else ""
+        frames = [f for f in traceback.extract_stack() if f.filename.startswith(PACKAGE)]
+        where = f"{frames[-1].filename.removeprefix(PACKAGE)}:{frames[-1].name}" if frames else ""
         for taken in TRANSFERS:
             taken.append(Transfer(way, values, where))
 

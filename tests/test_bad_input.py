@@ -411,12 +411,12 @@ def test_damaged_images_end_in_words(kind: str) -> None:
     buffer = io.BytesIO()
     Image.fromarray(made.image(1)).save(buffer, kind)
     refused = 0
-    for _ in range(400):
+    for _ in range(100):
         try:
             assert decode_image(damaged(buffer.getvalue(), rng), "damaged").dtype == np.uint8
         except InputError:
             refused += 1
-    assert refused > 100
+    assert refused > 25
 
 
 def test_damaged_zips_and_indices_end_in_words(good_scene: Path, tmp_path: Path) -> None:
@@ -425,7 +425,7 @@ def test_damaged_zips_and_indices_end_in_words(good_scene: Path, tmp_path: Path)
     packed = write_zip(tmp_path / "scene", tmp_path / "scene.zip").read_bytes()
     index = (tmp_path / "scene" / "scene.json").read_bytes()
     refused = 0
-    for _ in range(150):
+    for _ in range(40):
         (tmp_path / "damaged.zip").write_bytes(damaged(packed[-3000:], rng).join([packed[:-3000], b""]))
         (tmp_path / "scene" / "scene.json").write_bytes(damaged(index, rng))
         for path in (tmp_path / "damaged.zip", tmp_path / "scene"):
@@ -434,4 +434,4 @@ def test_damaged_zips_and_indices_end_in_words(good_scene: Path, tmp_path: Path)
                 read_points(scene, scene.sweeps[0])
             except MudgError:
                 refused += 1
-    assert refused > 150
+    assert refused > 40

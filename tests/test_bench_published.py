@@ -174,6 +174,7 @@ def test_a_method_for_comparison_keeps_what_the_preset_sets_and_it_does_not_know
 # ---- the published model through all three -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_table_2_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
     model, _ = weights
     words = ("bench paper city:development --preset paper --table mudg2 --logs 1 --frames 0:6 --resolution 64x48 --processes 1 --no-videos "
@@ -218,6 +219,7 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
     assert (fused.box_growth_m, fused.occlusion_test) == (0.0, False)
 
 
+@pytest.mark.slow
 def test_shift_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
     config = published_set_up(weights, "--logs", "1", "--methods", "mudg_r", "mudg_s", "--fit.virtual.perception", "filters")
     rules = LogRules(frames=6, width=64, height=48, cameras=("front",))

@@ -333,7 +333,7 @@ def test_half_of_the_clips_on_the_path_have_points_of_other_frames():
 
 
 def test_city_clips_with_the_condition_of_freevs():
-    rules = from_city.CityClipRules(48, 32, window=3, clips=2, near_points=True)
+    rules = from_city.CityClipRules(48, 32, window=1, clips=1, near_points=True)
     clips_of = from_city.make_clips(rules, 7)
     full = from_city.make_clips(replace(rules, near_points=False), 7)
     for near, whole in zip(clips_of, full, strict=True):

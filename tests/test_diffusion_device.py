@@ -109,7 +109,8 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     assert sorted(crossed.to_host) == sorted(back + fits)
 
 
-@pytest.mark.parametrize("changes", [{"n_samples": 2}, {"sampler": "dpm_solver", "steps": 4}, {"align": False}])
+@pytest.mark.parametrize("changes", [{"n_samples": 2}, pytest.param({"sampler": "dpm_solver", "steps": 4}, marks=pytest.mark.slow),
+                                     pytest.param({"align": False}, marks=pytest.mark.slow)])  # fmt: skip
 def test_other_requests_and_a_second_window_too(small, changes):
     condition = made_up_clip(2).condition
     first = generated(small, condition, SampleRequest(1, 5))
@@ -121,7 +122,7 @@ def test_other_requests_and_a_second_window_too(small, changes):
     assert far_apart(known["rgb"], here.latents["rgb"][:2]) < NEAR
 
 
-@pytest.mark.parametrize("guidance", [1.0, 7.5])
+@pytest.mark.parametrize("guidance", [pytest.param(1.0, marks=pytest.mark.slow), 7.5])
 def test_a_clip_of_the_published_kind_is_the_same_on_a_device_and_crosses_once(guidance):
     model, condition, request = tiny_model(), some_condition(), SampleRequest(3, 5, guidance=guidance)
     here = generated(model, condition, request)
@@ -223,6 +224,7 @@ def street(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
     files.save(small, tmp_path / "model", "", {})
     config = SynthesizeConfig(shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1)
@@ -242,18 +244,24 @@ def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
             assert (a[i].semantics != b[i].semantics).float().mean() < 1e-2
 
 
-def test_float16_is_for_published_type_models_on_cards(street, tmp_path):
-    """Weights and views are in it there; on the CPU, and for other models, it is refused before anything is written."""
-    model, out = write_tiny(tmp_path), tmp_path / "out"
-    config = SynthesizeConfig(shifts_m=(1.0,), model=str(model), steps=2, guidance=1.0, device="cpu", precision="float16")
-    given = street / "scene", street / "fuse"
+def in_float16(folder):
+    return SynthesizeConfig(shifts_m=(1.0,), model=str(write_tiny(folder)), steps=2, guidance=1.0, device="cpu", precision="float16")
+
+
+def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
+    config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
     with pytest.raises(UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"):
         synthesize.run(config, *given, out)
+    with pretend_device(), pytest.raises(UsageError, match="another model on pretend"):
+        synthesize.run(replace(config, model="embedded-tiny", guidance=None, device="pretend"), *given, out)
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(street, tmp_path):
+    config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
     here = synthesize.run(replace(config, precision="float32"), *given, tmp_path / "here")
     with pretend_device():
-        with pytest.raises(UsageError, match="another model on pretend"):
-            synthesize.run(replace(config, model="embedded-tiny", guidance=None, device="pretend"), *given, out)
-        assert not out.exists()
         assert loading.load_any(replace(config, device="pretend")).dtype == torch.float16
         there = synthesize.run(replace(config, device="pretend"), *given, out)
     a, b = read_observations(here / "front_shift+1.0"), read_observations(there / "front_shift+1.0")
@@ -261,6 +269,7 @@ def test_float16_is_for_published_type_models_on_cards(street, tmp_path):
     assert 0 < max(apart) < 0.02  # measured: see the message of a failure
 
 
+@pytest.mark.slow
 def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_path):
     config = AnnotateConfig(device="cpu", processes=1, depth=False)
     scenes = [read_scene(annotate.run(config, street / "scene", tmp_path / "here"))]
@@ -309,6 +318,7 @@ def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
     assert sorted(crossed.to_device)[-2:] == [3 * 600, 3 * 600]  # two images
 
 
+@pytest.mark.slow
 def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
     tiny_networks.segformer(tmp_path / "net")
     tiny_networks.depth_anything(tmp_path / "depth")

@@ -196,7 +196,7 @@ class Steps:
         monkeypatch.setattr(fit, "_densify_if_due", ended)
 
 
-@pytest.mark.parametrize("method", ["street_gaussians", "mudg_s"])
+@pytest.mark.parametrize("method", [pytest.param("street_gaussians", marks=pytest.mark.slow), "mudg_s"])
 def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path, monkeypatch, method):
     steps, pixels = Steps(), {SIZE[0] * SIZE[1], 30 * 20}
     config = settings(method, "pretend", densify__kind="none", iterations=5, start__gaussians=60, poses__learn=True, poses__rounds=0,
@@ -437,6 +437,7 @@ def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
 # ---- render and score -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypatch):
     drawn = RenderConfig(cameras=("front",), shifts_m=(0.0,), video=False, raster="torch", device="cpu")
     with twins():

@@ -39,6 +39,7 @@ TINY = {
     "radiance__first_proposal_grid": (2, 1, 4, 8, 9), "radiance__second_proposal_grid": (2, 1, 4, 16, 9),
     "radiance__width": 8, "radiance__proposal_width": 8, "radiance__appearance": 4,
 }  # fmt: skip
+FEW_RAYS = {"radiance__rays": 8, "radiance__lidar_rays": 8, "radiance__proposal_samples": (6, 4), "radiance__samples": 4}
 
 
 def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -258,17 +259,17 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
 
 
 def test_a_short_fit_lowers_its_losses(world):
-    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
-    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 81)]
+    state, config = started(world, iterations=50, radiance__rays=96, radiance__lidar_rays=96, radiance__samples=12)
+    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 51)]
     for name in ("color", "lidar"):
         assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
 
 
 def test_a_step_on_another_device_is_the_same(world):
     with pretend_device() as there:
-        state, config = started(world, there)
+        state, config = started(world, there, **FEW_RAYS)
         elsewhere = [{name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()} for step in (1, 2)]
-    state, config = started(world)
+    state, config = started(world, **FEW_RAYS)
     for step, found in zip((1, 2), elsewhere):
         for name, value in loop.take_step(state, config, step).items():
             assert found[name] == pytest.approx(float(value.detach()), rel=1e-3, abs=1e-6), name

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import io
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -83,29 +87,38 @@ def test_a_run_in_python_doctor_and_render(run: Path, tmp_path: Path, capsys: py
     assert pictures and all(one[name] == two[name] == three[name] for name in pictures)
 
 
-@pytest.mark.parametrize(
-    ("line", "code", "said"),
-    [
-        ("synthesize TOY/scene --fused TOY/fit --out OUT", 3, "made by `mudg fuse`"),
-        ("synthesize TOY/none --fused TOY/fit --out OUT", 3, "no such file or folder"),
-        ("synthesize TOY/scene --out OUT", 2, "no --fused was given"),
-        ("render TOY/scene --model TOY/scene --out OUT", 3, "made by `mudg fit`"),
-        ("render TOY/fit --model TOY/fit --out OUT", 3, "not a scene"),
-        ("render TOY/scene --out OUT", 2, "no --model was given"),
-        ("adapt TOY/scene --fused TOY --out OUT", 3, "made by `mudg fuse`"),
-        ("fit TOY/scene --fused TOY/none --out OUT", 3, "made by `mudg fuse`"),
-        ("page TOY/fit --scene TOY/none --out OUT.html", 3, "no such file or folder"),
-        ("export ply TOY/fit --scene TOY/none --out OUT.ply", 3, "no such file or folder"),
-    ],
-)
-def test_wrong_paths_are_refused_before_anything_heavy_is_loaded(line: str, code: int, said: str, tmp_path: Path) -> None:
+WRONG_PATHS = [
+    ("synthesize TOY/scene --fused TOY/fit --out OUT", 3, "made by `mudg fuse`"),
+    ("synthesize TOY/none --fused TOY/fit --out OUT", 3, "no such file or folder"),
+    ("synthesize TOY/scene --out OUT", 2, "no --fused was given"),
+    ("render TOY/scene --model TOY/scene --out OUT", 3, "made by `mudg fit`"),
+    ("render TOY/fit --model TOY/fit --out OUT", 3, "not a scene"),
+    ("render TOY/scene --out OUT", 2, "no --model was given"),
+    ("adapt TOY/scene --fused TOY --out OUT", 3, "made by `mudg fuse`"),
+    ("fit TOY/scene --fused TOY/none --out OUT", 3, "made by `mudg fuse`"),
+    ("page TOY/fit --scene TOY/none --out OUT.html", 3, "no such file or folder"),
+    ("export ply TOY/fit --scene TOY/none --out OUT.ply", 3, "no such file or folder"),
+]
+
+ANSWERS = """
+import contextlib, io, json, sys
+from mudg import app
+for line in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = app.main(line.split())
+    print(json.dumps([code, said.getvalue(), "torch" in sys.modules]))
+"""
+
+
+def test_wrong_paths_are_refused_before_anything_heavy_is_loaded(tmp_path: Path) -> None:
     write_toy_run(tmp_path)
-    words = line.replace("TOY", str(tmp_path)).replace("OUT", str(tmp_path / "out")).split()
-    script = f"import sys; from mudg import app; code = app.main({words!r}); print('torch' in sys.modules); raise SystemExit(code)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert done.returncode == code and said in done.stderr, done.stderr
-    assert done.stdout.strip() == "False", "torch was loaded"
-    assert not (tmp_path / "out").exists()
+    lines = [line.replace("TOY", str(tmp_path)).replace("OUT", str(tmp_path / "out")) for line, _, _ in WRONG_PATHS]
+    done = subprocess.run([sys.executable, "-c", ANSWERS, json.dumps(lines)], capture_output=True, text=True, check=True)
+    answers = [json.loads(answer) for answer in done.stdout.splitlines()]
+    for (line, code, said), (left, message, torch_loaded) in zip(WRONG_PATHS, answers, strict=True):
+        assert left == code and said in message, (line, message)
+        assert not torch_loaded, f"{line}: torch was loaded"
+    assert not list(tmp_path.glob("out*"))
 
 
 def test_in_python_wrong_paths_are_refused_too(tmp_path: Path) -> None:
@@ -116,10 +129,21 @@ def test_in_python_wrong_paths_are_refused_too(tmp_path: Path) -> None:
         FittedScene.read(scene)
 
 
+@functools.cache
+def help_of(page: str, asked: str) -> str:
+    """What a command prints that is asked for help."""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert app.main([*page.split(), asked]) == 0
+    return said.getvalue()
+
+
+def test_short_help_is_help() -> None:
+    assert help_of("ingest kitti", "-h") == help_of("ingest kitti", "--help")
+
+
 @pytest.mark.parametrize("verb", steps.VERBS)
-def test_help_all_works_for_every_verb(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert app.main([*verb.split(), "--help-all"]) == 0
-    said = capsys.readouterr().out
+def test_help_all_works_for_every_verb(verb: str) -> None:
+    said = help_of(verb, "--help-all")
     assert f"usage: mudg {verb}" in said and "--quiet" in said
 
 
@@ -137,12 +161,9 @@ def test_help_all_works_for_every_verb(verb: str, capsys: pytest.CaptureFixture[
         ("asset import", ("--label", "--kind"), ("--scene",)),
     ],
 )
-@pytest.mark.parametrize("asked", ["--help", "--help-all", "-h"])
-def test_parts_of_verbs_have_pages_of_their_own(
-    page: str, shown: tuple[str, ...], others: tuple[str, ...], asked: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert app.main([*page.split(), asked]) == 0
-    said = capsys.readouterr().out
+@pytest.mark.parametrize("asked", ["--help", "--help-all"])
+def test_parts_of_verbs_have_pages_of_their_own(page: str, shown: tuple[str, ...], others: tuple[str, ...], asked: str) -> None:
+    said = help_of(page, asked)
     assert f"usage: mudg {page}" in said and "--quiet" in said
     listed = {line.split()[0].replace("[no-]", "") for line in said.splitlines() if line.startswith("  --")}
     assert set(shown) <= listed and not set(others) & listed

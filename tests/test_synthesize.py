@@ -60,8 +60,20 @@ def frames_of(path):
     return [found[i] for i in range(len(found))]
 
 
-def test_every_frame_is_made(world, tmp_path):
-    out = made(world, tmp_path / "out")
+@pytest.fixture(scope="module")
+def usual(world, tmp_path_factory):
+    """What the settings of ``world`` give."""
+    return made(world, tmp_path_factory.mktemp("usual") / "out")
+
+
+@pytest.fixture(scope="module")
+def large(world, tmp_path_factory):
+    """The same at the camera's size."""
+    return made(world, tmp_path_factory.mktemp("large") / "out", full_size=True)
+
+
+def test_every_frame_is_made(usual):
+    out = usual
     sets = list_observation_sets(out)
     assert list(sets) == ["front_shift+1.0"]
     found = read_observations(sets["front_shift+1.0"])
@@ -80,8 +92,8 @@ def test_every_frame_is_made(world, tmp_path):
     assert not (out / "front_shift+1.0" / "state").exists()
 
 
-def test_interruption_leaves_no_trace(world, tmp_path, monkeypatch):
-    whole = frames_of(made(world, tmp_path / "whole") / "front_shift+1.0")
+def test_interruption_leaves_no_trace(world, usual, tmp_path, monkeypatch):
+    whole = frames_of(usual / "front_shift+1.0")
     make = synthesize.ViewMaker.make
 
     def stop_in_second_window(self, views, number, known):
@@ -102,6 +114,7 @@ def test_interruption_leaves_no_trace(world, tmp_path, monkeypatch):
         assert torch.equal(a.semantics, b.semantics), index
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_as_one(world, tmp_path):
     one = made(world, tmp_path / "one", shifts_m=(1.0, -1.0))
     two = made(world, tmp_path / "two", shifts_m=(1.0, -1.0), processes=2)
@@ -110,14 +123,13 @@ def test_processes_give_the_same_as_one(world, tmp_path):
             assert torch.equal(a.rgb, b.rgb)
 
 
-def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world, tmp_path, monkeypatch):
+def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world, usual, tmp_path, monkeypatch):
     prepared, prepare = [], condition._prepare_source
     monkeypatch.setattr(condition, "_prepare_source", lambda *given: prepared.append(given[1].view.time_s) or prepare(*given))
-    both = made(world, tmp_path / "both", shifts_m=(1.0, 2.0))
+    both = made(world, tmp_path / "both", shifts_m=(2.0, 1.0))
     assert len(prepared) == len(set(prepared)) > 1
     assert synthesize._drive_again.cache_info().currsize == 0
-    alone = made(world, tmp_path / "alone", shifts_m=(2.0,))
-    for one, other in zip(*(frames_of(out / "front_shift+2.0") for out in (both, alone)), strict=True):
+    for one, other in zip(*(frames_of(out / "front_shift+1.0") for out in (both, usual)), strict=True):
         assert torch.equal(one.rgb, other.rgb)
         assert torch.equal(one.depth.nan_to_num(), other.depth.nan_to_num())
 
@@ -132,34 +144,31 @@ def test_prepared_images_are_kept_exactly():
     assert dict.__getitem__(images, 0).rgb.dtype == torch.uint8
 
 
-def test_conditions_in_files_change_nothing(world, tmp_path, monkeypatch):
-    usual = made(world, tmp_path / "usual", full_size=True)
+def test_conditions_in_files_change_nothing(world, large, tmp_path, monkeypatch):
     mapped, map_array = [], scratch.mapped_array
     monkeypatch.setattr(stacked, "LARGE_PIXELS", 0)
     monkeypatch.setattr(scratch, "mapped_array", lambda folder, *asked: mapped.append(folder) or map_array(folder, *asked))
     filed = made(world, tmp_path / "filed", full_size=True)
     assert set(mapped) == {filed}
-    assert sorted(p.relative_to(filed) for p in filed.rglob("*")) == sorted(p.relative_to(usual) for p in usual.rglob("*"))
-    for a, b in zip(frames_of(usual / "front_shift+1.0"), frames_of(filed / "front_shift+1.0"), strict=True):
+    assert sorted(p.relative_to(filed) for p in filed.rglob("*")) == sorted(p.relative_to(large) for p in large.rglob("*"))
+    for a, b in zip(frames_of(large / "front_shift+1.0"), frames_of(filed / "front_shift+1.0"), strict=True):
         assert torch.equal(a.rgb, b.rgb)
         assert torch.equal(a.depth.nan_to_num(), b.depth.nan_to_num())
         assert torch.equal(a.semantics, b.semantics)
 
 
-def test_full_size_views_have_the_cameras_size(world, tmp_path):
-    out = made(world, tmp_path / "out", full_size=True)
-    first = read_observations(out / "front_shift+1.0")[2]
+def test_full_size_views_have_the_cameras_size(large):
+    first = read_observations(large / "front_shift+1.0")[2]
     assert first.rgb.shape == (3, 64, 96)
     assert first.semantics.shape == (64, 96)
     assert first.view.camera.width == 96
 
 
-def test_finished_result_is_reused(world, tmp_path, monkeypatch):
-    made(world, tmp_path / "out")
+def test_finished_result_is_reused(world, usual, monkeypatch):
     monkeypatch.setattr(synthesize, "make_trajectory", None)
-    made(world, tmp_path / "out")
+    made(world, usual)
     with pytest.raises(UsageError, match="another configuration"):
-        made(world, tmp_path / "out", steps=3)
+        made(world, usual, steps=3)
 
 
 @pytest.mark.parametrize("frames", [1, 3, 8, 9, 13, 24, 199])
@@ -212,28 +221,26 @@ def test_bad_requests(world, tmp_path):
         made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
 
 
-def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, tmp_path):
+def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, usual, tmp_path):
     out = made(world, tmp_path / "lane", shifts_m=(), paths=("lane+0.2",))
     lane = read_observations(out / "front_lane+0.2")
     start = trajectory.recorded(read_scene(world[0] / "scene"), "front").views
     assert len(lane) == FRAMES
     assert [round(float(torch.tensor(a.center_world - b.center_world).norm()), 3) for a, b in zip(lane.views, start)][:3] == [0.0, 0.2, 0.4]
-    seen = {
-        parts: frames_of(made(world, tmp_path / parts, condition=parts) / "front_shift+1.0")[2].rgb
-        for parts in ("full", "reference", "points", "concat")
-    }
+    outs = {parts: made(world, tmp_path / parts, condition=parts) for parts in ("reference", "points", "concat")} | {"full": usual}
+    seen = {parts: frames_of(folder / "front_shift+1.0")[2].rgb for parts, folder in outs.items()}
     names = list(seen)
     assert all(not torch.equal(seen[a], seen[b]) for a in names for b in names if a < b)
 
 
-def test_the_condition_of_freevs_gives_colour_alone(world, tmp_path):
+def test_the_condition_of_freevs_gives_colour_alone(world, usual, tmp_path):
     out = made(world, tmp_path / "freevs", condition="freevs") / "front_shift+1.0"
-    seen, usual = frames_of(out), frames_of(made(world, tmp_path / "full") / "front_shift+1.0")
+    seen = frames_of(out)
     assert len(seen) == FRAMES
     assert all(o.depth is None and o.semantics is None and o.source == "freevs" for o in seen)
-    assert all(not torch.equal(a.rgb, b.rgb) for a, b in zip(seen, usual))
-    large = frames_of(made(world, tmp_path / "large", condition="freevs", full_size=True) / "front_shift+1.0")
-    assert large[0].rgb.shape == (3, 64, 96)
+    assert all(not torch.equal(a.rgb, b.rgb) for a, b in zip(seen, frames_of(usual / "front_shift+1.0")))
+    enlarged = frames_of(made(world, tmp_path / "large", condition="freevs", full_size=True) / "front_shift+1.0")
+    assert enlarged[0].rgb.shape == (3, 64, 96)
 
 
 def test_a_setting_that_the_sampler_does_not_take_ends_the_command(tmp_path, capsys):

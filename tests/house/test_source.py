@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,6 +56,22 @@ def syntax_of(path: Path, _modified_ns: int) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 
+@functools.lru_cache(maxsize=4000)
+def walk(tree: ast.AST) -> tuple[ast.AST, ...]:
+    """All nodes of a tree, in the order of ``ast.walk``; listed once for all rules."""
+    return tuple(ast.walk(tree))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _syntax_without_collections() -> Iterator[None]:
+    """Millions of nodes make each pass of the garbage collector slow: none runs here, and the nodes go at the end."""
+    gc.disable()
+    yield
+    for cached in (syntax_of, walk, calls, imported_modules):
+        cached.cache_clear()
+    gc.enable()
+
+
 def parsed(package_dir: Path) -> Iterator[tuple[str, ast.Module]]:
     for path in sources(package_dir):
         yield path.relative_to(package_dir).as_posix(), syntax_of(path, path.stat().st_mtime_ns)
@@ -72,28 +89,28 @@ def dotted(node: ast.AST) -> str:
     return ""
 
 
-def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            yield node, dotted(node.func)
+@functools.lru_cache(maxsize=4000)
+def calls(tree: ast.AST) -> list[tuple[ast.Call, str]]:
+    return [(node, dotted(node.func)) for node in walk(tree) if isinstance(node, ast.Call)]
 
 
-def imported_modules(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Yield (line, dotted module) of every import, late ones included, type-checking ones left out."""
+@functools.lru_cache(maxsize=4000)
+def imported_modules(tree: ast.AST) -> list[tuple[int, str]]:
+    """Return (line, dotted module) of every import, late ones included, type-checking ones left out."""
     skipped: set[ast.AST] = set()
-    for node in ast.walk(tree):
+    for node in walk(tree):
         if isinstance(node, ast.If) and dotted(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
             skipped.update(inner for child in node.body for inner in ast.walk(child))
-    for node in ast.walk(tree):
+    imports = []
+    for node in walk(tree):
         if node in skipped:
             continue
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield node.lineno, alias.name
+            imports += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"line {node.lineno}: imports are absolute in this package"
-            for alias in node.names:
-                yield node.lineno, f"{node.module}.{alias.name}"
+            imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+    return imports
 
 
 def top_level_imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
@@ -126,7 +143,7 @@ def test_only_these_modules_can_open_a_connection(package_dir: Path, repository:
             if kind not in (None, "socket") and kind not in CONNECTING.get(name, ()):
                 problems.append(f"{name}:{line}: imports {module}")
         problems += [
-            f"{name}:{node.lineno}: socket.{node.attr}" for node in ast.walk(tree)
+            f"{name}:{node.lineno}: socket.{node.attr}" for node in walk(tree)
             if isinstance(node, ast.Attribute) and dotted(node).startswith("socket.") and node.attr not in ("gethostname", "timeout")
             and not CONNECTING.get(name)
         ]  # fmt: skip
@@ -275,7 +292,7 @@ def test_no_global_random_state(package_dir: Path) -> None:
 def test_no_blind_except(package_dir: Path) -> None:
     problems = []
     for name, tree in parsed(package_dir):
-        for node in ast.walk(tree):
+        for node in walk(tree):
             if not isinstance(node, ast.ExceptHandler):
                 continue
             kinds = node.type.elts if isinstance(node.type, ast.Tuple) else [node.type]
@@ -300,7 +317,7 @@ def test_files_and_functions_stay_short(package_dir: Path) -> None:
         if lines > MAX_FILE_LINES:
             problems.append(f"{path.relative_to(package_dir)}: {lines} lines")
     for name, tree in parsed(package_dir):
-        for node in ast.walk(tree):
+        for node in walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 length = length_without_docstring(node)
                 if length > MAX_FUNCTION_LINES:
@@ -318,7 +335,7 @@ def test_stages_hold_verbs_only(package_dir: Path) -> None:
 def test_functions_take_few_parameters(package_dir: Path) -> None:
     problems = []
     for name, tree in parsed(package_dir):
-        for node in ast.walk(tree):
+        for node in walk(tree):
             if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
             every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
@@ -461,7 +478,7 @@ def test_class_names_say_what_a_thing_is(package_dir: Path) -> None:
         [
             f"{name}:{node.lineno}: {node.name}"
             for name, tree in parsed(package_dir)
-            for node in ast.walk(tree)
+            for node in walk(tree)
             if isinstance(node, ast.ClassDef) and vague.search(node.name)
         ]
     )

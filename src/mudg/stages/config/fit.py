@@ -188,7 +188,7 @@ class FitConfig:
     """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
 
     method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"] = "mudg_s"
-    """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, also supervised by
+    """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, supervised by
     virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier, difix (which learns from repaired renders): published
     methods for comparison (docs/baselines.md)."""
     iterations: int = Field(default=2000, ge=1, le=1_000_000)
