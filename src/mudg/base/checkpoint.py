@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mudg.base import log, store
-from mudg.base.errors import IntegrityError
+from mudg.base.errors import InputError, IntegrityError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -114,8 +114,8 @@ def latest(folder: Path) -> Checkpoint | None:
         try:
             store.verify_manifest(path)
             content = store.read_json(path / "state.json")
-            return Checkpoint(int(content["step"]), path, content["state"])
-        except IntegrityError as error:
+            return Checkpoint(int(content["step"]), path, dict(content["state"]))
+        except (IntegrityError, InputError, KeyError, TypeError, ValueError) as error:
             problems.append(str(error))
             log.warn(f"checkpoint {path} does not verify and is skipped:", *str(error).splitlines())
     if problems:

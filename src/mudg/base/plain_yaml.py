@@ -14,7 +14,7 @@ import yaml
 
 from mudg.base.errors import InputError
 
-LARGEST_BYTES: Final = 500_000
+LARGEST_BYTES: Final = 100_000
 """Of settings and edits; lists of scenes may be larger."""
 DEEPEST: Final = 32
 BYTES_A_VALUE: Final = 5

@@ -24,6 +24,7 @@ from mudg.base import log, store
 from mudg.base.config import differences
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.base.processes import process_alive
+from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.replacement import Replacement, all_names, remove_files
 from mudg.base.usage import Meter, Usage, folder_bytes
 
@@ -121,6 +122,19 @@ def _identity(path: Path) -> object:
 # what is in a folder --------------------------------------------------------------------------------------------------
 
 
+class _State(ForeignRecord):
+    """What is read of ``run.json``."""
+
+    verb: str
+    key: str
+    state: str
+    inputs: dict[str, str] = {}
+    files: list[str] = []
+    seconds: Number = 0.0
+    processor_s: Number = 0.0
+    peak_bytes: int | None = None
+
+
 @dataclass(frozen=True)
 class VerbOutput:
     """What a verb writes.
@@ -176,12 +190,12 @@ def run_state(folder: Path) -> dict[str, Any]:
         return {}
     try:
         state = store.read_json(folder / _STATE)
+        parse_record(_State, state, str(folder / _STATE))
     except InputError as error:
         raise refused from error
-    known = isinstance(state, dict) and state.get("schema") == store.RUN_SCHEMA
-    if not known or not all(isinstance(state.get(name), str) for name in ("verb", "key", "state")):
+    if state.get("schema") != store.RUN_SCHEMA:
         raise refused
-    return state
+    return dict(state)
 
 
 def known_input(folder: Path, name: str) -> Path | None:

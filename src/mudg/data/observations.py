@@ -168,6 +168,8 @@ def read_observations(path: Path) -> ObservationSet:
             raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
                 got=str(content["schema"]))  # fmt: skip
         records = content["observations"]
+        if not records:
+            raise InputError("no views are listed", where=str(index))
         cameras = [_camera(r["camera"], f"{index}: observations[{i}].camera") for i, r in enumerate(records)]
         poses = [np.asarray(r["world_from_cam"], np.float64) for r in records]
         views = tuple(View(c, p, float(r["time_s"])) for c, p, r in zip(cameras, poses, records, strict=True))

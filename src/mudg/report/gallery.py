@@ -6,7 +6,7 @@ import base64
 import io
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -15,6 +15,7 @@ from PIL import Image, UnidentifiedImageError
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.records import understood
 from mudg.report import html
 from mudg.report.run_report import viewer_address
 from mudg.report.score_tables import TERMINAL_METRICS, number_text
@@ -57,8 +58,13 @@ def read_shown(folder: Path) -> GalleryEntry:
     """
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder))
-    if (folder / "bench.json").is_file():
-        return _bench(folder)
+    with understood("a finished run", str(folder)):
+        entry = _bench(folder) if (folder / "bench.json").is_file() else _run_or_scores(folder)
+        page([replace(entry, picture=None)], [], folder / "page.html")  # what cannot be shown ends here
+    return entry
+
+
+def _run_or_scores(folder: Path) -> GalleryEntry:
     state = store.read_json(folder / store.RUN_STATE) if (folder / store.RUN_STATE).is_file() else {}
     asked = state.get("asked", {}) if isinstance(state, dict) else {}
     if isinstance(asked, dict) and asked.get("verb") == "run":

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mudg import native
 from mudg.base import log, store
 from mudg.base.processes import computed_ahead
+from mudg.base.records import understood
 from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.report.page import FPS, PANEL_ROWS, Adaptation, TrajectoryVideo, page
@@ -53,12 +54,13 @@ def film(out: Path) -> list[TrajectoryVideo]:
         InputError: the run is not scored yet, or a folder of views is damaged.
     """
     out = Path(out)
-    scores = store.read_json(out / "score" / "metrics.json")
-    folders = _folders(out, scores)
+    with understood("a scored run", str(out)):
+        scores = store.read_json(out / "score" / "metrics.json")
+        folders = _folders(out, scores)
+        trajectories = [t for t in scores["trajectories"] if any(t["name"] in found for found in folders.values())]
     playable = bool(video_encoders())
     if not playable:
         log.warn("PyAV has no H.264 encoder here: the report shows one picture per trajectory instead of a video")
-    trajectories = [t for t in scores["trajectories"] if any(t["name"] in found for found in folders.values())]
     budget = BUDGET_BYTES // max(1, len(trajectories)) if playable else 0
     videos = computed_ahead(lambda n: _video(trajectories[n], folders, budget), len(trajectories), native.default_threads())
     return list(log.progress(videos, len(trajectories), "report"))
@@ -67,12 +69,12 @@ def film(out: Path) -> list[TrajectoryVideo]:
 def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     """The cheap half: scores, times and settings around the videos, and a link to the viewer page if there is one."""
     out = Path(out)
-    scores = store.read_json(out / "score" / "metrics.json")
-    ledger = store.read_json(out / "run.json")
     settings = out / "run.yaml"
     text = store.read_text(settings) if settings.is_file() else ""
-    columns = list(_folders(out, scores))
-    store.write_text(out / "report.html", page(scores, ledger, text, videos, columns, _adaptation(out / "adapt"), viewer_address(out), out))
+    with understood("a scored run", str(out)):
+        scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
+        content = page(scores, ledger, text, videos, list(_folders(out, scores)), _adaptation(out / "adapt"), viewer_address(out), out)
+    store.write_text(out / "report.html", content)
     return out / "report.html"
 
 

@@ -99,10 +99,10 @@ def own_names(folder: Path) -> list[str]:
         content = store.read_json(folder / "model.json")
         files = list(content["files"]) if "files" in content else []
         files += [f"{part}/{name}" for part, entry in content.get("parts", {}).items() for name in entry["files"]]
+        there = set(all_names(folder))
+        return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
     except (InputError, KeyError, TypeError, AttributeError):
         return []
-    there = set(all_names(folder))
-    return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
 
 
 Work = Callable[[], None]

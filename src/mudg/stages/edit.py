@@ -13,6 +13,7 @@ from typing import Any
 from mudg.base import log, store
 from mudg.base.config import result_settings
 from mudg.base.errors import UsageError
+from mudg.base.records import understood
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.raster.place import drawing_device
@@ -112,7 +113,8 @@ def _write_run(drive: EditedDrive, parts: RunParts, scene: Scene, images: Edited
     for name, path in parts.fits.items():
         if not (out / "fit" / name / "model.json").is_file():
             save_model(images.after if path == parts.model else drive.model(load_model(path)), out / "fit" / name)
-    return {name: int(value) for name, value in store.read_json(out / "lidar.json").items() if name != "schema"}
+    with understood("counts of LiDAR returns", str(out / "lidar.json")):
+        return {name: int(value) for name, value in store.read_json(out / "lidar.json").items() if name != "schema"}
 
 
 def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
@@ -121,5 +123,6 @@ def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
         return {}
     report = store.read_json(parts.fused / "fuse.json")
     own = ("format", "schema_version", "static", "objects", "camera_colors")
-    kept = {key: value for key, value in report.items() if key not in own}
-    return {**kept, "tracks": {key: value for key, value in kept.get("tracks", {}).items() if key in cloud.objects}}
+    with understood("a report of fused clouds", str(parts.fused / "fuse.json")):
+        kept = {key: value for key, value in report.items() if key not in own}
+        return {**kept, "tracks": {key: value for key, value in kept.get("tracks", {}).items() if key in cloud.objects}}

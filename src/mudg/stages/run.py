@@ -15,6 +15,7 @@ from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError
 from mudg.base.memory import in_words
+from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
@@ -330,6 +331,22 @@ def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     )
 
 
+class _StepRecord(ForeignRecord):
+    state: str
+    seconds: Number
+    processor_s: Number = 0.0
+    peak_bytes: int | None = None
+    written_bytes: int = 0
+
+
+class _LedgerRecord(ForeignRecord):
+    """What is read of ``OUT/run.json``."""
+
+    asked: dict[str, Any]
+    steps: dict[str, _StepRecord] = {}
+    report: dict[str, str] = {}
+
+
 class _Ledger:
     """OUT/run.json: what was asked, and how long each step took over all continuations."""
 
@@ -376,14 +393,15 @@ class _Ledger:
         """An earlier ledger; UsageError if the file is something else, as the run.json of a single verb is."""
         try:
             content = store.read_json(path)
-            if content["asked"]["verb"] == "run":
-                if not store.check_holds(content):
-                    raise IntegrityError("the record of the run was altered after it was written", where=str(path),
-                        remedy="choose another --out, or restore the file")  # fmt: skip
-                return content
-        except (InputError, KeyError, TypeError):
-            pass
-        raise cls._foreign(path.parent)
+            own = parse_record(_LedgerRecord, content, str(path)).asked.get("verb") == "run"
+        except InputError as error:
+            raise cls._foreign(path.parent) from error
+        if not own:
+            raise cls._foreign(path.parent)
+        if not store.check_holds(content):
+            raise IntegrityError("the record of the run was altered after it was written", where=str(path),
+                remedy="choose another --out, or restore the file")  # fmt: skip
+        return dict(content)
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:
@@ -392,7 +410,7 @@ class _Ledger:
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""
         page = self._out / "report.html"
-        return self._report.get("key") == key and page.is_file() and self._report["sha256"] == store.sha256_file(page)
+        return self._report.get("key") == key and page.is_file() and self._report.get("sha256") == store.sha256_file(page)
 
     def remember_report(self, key: str) -> None:
         """Note what the page was made of, and its size: it is written after its step was noted."""

@@ -26,6 +26,7 @@ from mudg.base import log, palette, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import UsageError
 from mudg.base.processes import computed_ahead, one_torch_thread
+from mudg.base.records import understood
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project, view_metrics
@@ -155,7 +156,8 @@ def _lpips_record(config: ScoreConfig) -> dict[str, Any]:
 
 def summary_table(out: Path) -> str:
     """The main numbers of a finished score folder as plain text for a terminal."""
-    return score_tables.plain(store.read_json(Path(out) / "metrics.json"))
+    with understood("scores", str(Path(out) / "metrics.json")):
+        return score_tables.plain(store.read_json(Path(out) / "metrics.json"))
 
 
 # ---- the baseline ----

@@ -30,6 +30,7 @@ from mudg.base import log, memory, palette, store
 from mudg.base.config import result_settings
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
+from mudg.base.records import understood
 from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, Frame, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
@@ -261,7 +262,8 @@ def make_trajectory(
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
     first, tail = _read_state(state)
-    fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
+    with understood("depth fits of an interrupted synthesis", str(state / FITS)):
+        fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     every = max(1, len(path) // 5)
     with ObservationWriter(folder, path.name, COLOR_ALONE.get(config.condition, SOURCE)) as writer:
         done = spans[first - 1].stop if first else 0

@@ -37,6 +37,7 @@ from torch import Tensor
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError
+from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Camera, Clip, Condition, FinePatch, SparseDepth, View
 
@@ -150,8 +151,9 @@ def clips_in(folder: Path | ShardSource, city: int) -> int:
 
 
 def clips_at(path: Path) -> int:
-    """Number of clips in the shard at `path`."""
+    """Number of clips in the shard at `path`; InputError if its arrays are not those of a shard."""
     with _open(path) as shard:
+        _check_arrays(shard, path)
         return int(shard.get_slice("shift_m").get_shape()[0])
 
 
@@ -178,6 +180,48 @@ _PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "ba
 
 
 _RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
+_ARRAYS = {
+    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")), "reference": ("U8", "K3HW"),
+    **dict.fromkeys(("depth", "sparse_depth", "measured", "render_depth"), ("F16", "KTHW")),
+    **dict.fromkeys(
+        ("semantics", "flags", "ids", "backdrop_ids", "alpha", "certainty", "render_ids", "depth_confidence"), ("U8", "KTHW")
+    ),
+    "world_from_cam": ("F64", "KT44"), "intrinsics": ("F64", "KT4"), "shift_m": ("F32", "K"), "rendered": ("BOOL", "K"),
+    "place": ("I32", "K3"),
+}  # fmt: skip
+"""Types and axes of a shard's arrays: clips, frames, rows, columns, and sizes that are always the same."""
+
+
+def _check_arrays(shard: Any, path: Path) -> None:
+    """InputError where an array is missing, or of another type or size than the others say; only the header is read."""
+    names = set(shard.keys())
+    for prefix in ("", FINE) if f"{FINE}place" in names else ("",):
+        required = {prefix + name for name in (*_PER_FRAME, "reference", "shift_m", *(_RENDERS if f"{prefix}rendered" in names else ()))}
+        if required - names:
+            raise _damaged(path, "every array of a shard", f"no {', '.join(sorted(required - names))}")
+        shape = shard.get_slice(f"{prefix}rgb").get_shape()
+        sizes = {"3": 3, "4": 4, **dict(zip("KT3HW", shape, strict=False))}
+        for name, (kind, axes) in _ARRAYS.items():
+            if prefix + name in names:
+                part = shard.get_slice(prefix + name)
+                wanted = [sizes.get(axis, 0) for axis in axes]
+                if part.get_dtype() != kind or part.get_shape() != wanted or 0 in wanted or sizes["3"] != 3:
+                    got = f"{prefix}{name}: {part.get_dtype()} {part.get_shape()}"
+                    raise _damaged(path, f"{kind} {wanted}", got)
+
+
+def _check_values(found: Mapping[str, Tensor], path: Path) -> None:
+    """InputError for numbers that are not finite, and for classes that do not exist."""
+    for name, value in found.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            raise _damaged(path, "finite numbers", name)
+        if name in ("semantics", "ids", "backdrop_ids", "render_ids") and bool(((value >= len(CLASSES)) & (value != UNLABELLED)).any()):
+            raise _damaged(path, f"classes below {len(CLASSES)}, or {UNLABELLED}", f"{name}: {int(value[value != UNLABELLED].max())}")
+
+
+def _damaged(path: Path, expected: str, got: str) -> InputError:
+    return InputError("a shard of training clips is damaged", where=str(path), expected=expected, got=got,
+        remedy="delete it; it is made again")  # fmt: skip
 
 
 def read_clip(folder: Path | ShardSource, city: int, clip: int, frames: Sequence[int]) -> Clip:
@@ -190,14 +234,19 @@ def read_clip(folder: Path | ShardSource, city: int, clip: int, frames: Sequence
 def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
     """The same, of the shard at `path`."""
     with _open(path) as shard:
-        made = _read_part(shard, "", clip, frames)
+        _check_arrays(shard, path)
+        clips, most = shard.get_slice("rgb").get_shape()[:2]
+        if not (0 <= clip < clips and 0 <= min(frames) and max(frames) < most):
+            raise InputError("a shard has fewer clips or frames", where=str(path), got=f"{clips} clips of {most} frames",
+                expected=f"clip {clip}, frame {max(frames)}", remedy="choose another --data.clips, or a smaller --data.window")  # fmt: skip
+        made = _read_part(shard, "", clip, frames, path)
         if f"{FINE}place" not in shard.keys():
             return made
         row, column, scale = shard.get_slice(f"{FINE}place")[clip].tolist()
-        return replace(made, fine=FinePatch(_read_part(shard, FINE, clip, frames), row, column, scale))
+        return replace(made, fine=FinePatch(_read_part(shard, FINE, clip, frames, path), row, column, scale))
 
 
-def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Clip:
+def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: Path) -> Clip:
     """A clip, or its patch, from the arrays whose names begin with `prefix`."""
     there = set(shard.keys())
     if f"{prefix}effect" in there:
@@ -212,6 +261,7 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int]) -> Cli
     found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
     reference = torch.from_numpy(shard.get_slice(f"{prefix}reference")[clip])
     shift_m = float(shard.get_tensor(f"{prefix}shift_m")[clip])
+    _check_values({**found, "shift_m": torch.tensor(shift_m)}, path)
     image = lambda x: x.float() / 255  # noqa: E731
     plane = lambda x: x.float().unsqueeze(1)  # noqa: E731
     flags, (height, width) = found["flags"].unsqueeze(1), found["rgb"].shape[-2:]

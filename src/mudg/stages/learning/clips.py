@@ -74,6 +74,8 @@ def making_clips(config: LearnConfig, folder: Path, points_alone: bool = False) 
     rules = clip_rules(config, points_alone)
     wanted = [*held_out_cities(config), *(config.data.skip_cities + n for n in range(config.data.cities))]
     missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
+    for number in set(wanted).difference(missing):
+        clip_shards.clips_at(clip_shards.shard_path(folder, number))  # a damaged one is found before the training begins
     if not missing or config.compute.workers == 0:
         return contextlib.nullcontext()
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {config.compute.workers} processes")

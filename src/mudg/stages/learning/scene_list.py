@@ -28,7 +28,7 @@ from pydantic import BeforeValidator, Field
 from mudg.base import log, plain_yaml, seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
-from mudg.base.records import StrictRecord, parse_record
+from mudg.base.records import StrictRecord, parse_record, understood
 from mudg.data.clips import from_log
 from mudg.data.clips import shards as clip_shards
 from mudg.data.clips.from_city import HELD_OUT
@@ -313,7 +313,8 @@ class ListedShards:
 
         if not index.is_file():
             with_log(make)
-        count = int(store.read_json(index)["clips"])
+        with understood("the number of a log's clips", str(index)):
+            count = int(store.read_json(index)["clips"])
 
         def find(number: int) -> Path:
             def bring(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -15,6 +14,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import palette, store
+from mudg.base.records import understood
 from mudg.base.types import Clip
 from mudg.core import metrics
 from mudg.core.flicker import TrueFrame, flicker
@@ -196,11 +196,12 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
     """Draw the loss terms over the steps, both axes logarithmic, from the lines of log.jsonl."""
     points: dict[str, dict[int, float]] = {}
     for line in store.read_text(log_file).splitlines():
-        entry = json.loads(line)
-        if "total" in entry and "step" in entry:
-            for name in ("total", "rgb", "depth", "semantics"):
-                if name in entry:  # separate passes: a step has one modality
-                    points.setdefault(name, {})[int(entry["step"])] = float(entry[name])
+        with understood("a log of losses", str(log_file)):
+            entry = store.parse_json(line, str(log_file))
+            if "total" in entry and "step" in entry:
+                for name in ("total", "rgb", "depth", "semantics"):
+                    if name in entry:  # separate passes: a step has one modality
+                        points.setdefault(name, {})[int(entry["step"])] = float(entry[name])
     series = {n: sorted(p.items()) for n, p in points.items()}
     values = [v for p in series.values() for _, v in p if v > 0 and math.isfinite(v)]
     if not values:
@@ -210,7 +211,7 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
     last = max(s for p in series.values() for s, _ in p)
     low, high = math.log10(min(values)) - 0.05, math.log10(max(values)) + 0.05
     left = math.log10(50)
-    right = max(left + 0.01, math.log10(last))
+    right = max(left + 0.01, math.log10(max(last, 1)))
 
     def place(step: int, value: float) -> tuple[float, float]:
         x = 50 + (width - 70) * (math.log10(max(step, 50)) - left) / (right - left)

@@ -107,12 +107,12 @@ def _parsed(record: Any, sizes: Mapping[Any, tuple[str, float, float]], where: s
     try:
         given, category, score = record["image_id"], int(record["category_id"]), float(record.get("score", 1.0))
         x, y, width, height = (float(v) for v in record["bbox"])
+        name, across, down = sizes.get(given, (str(given), 1.0, 1.0))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
     if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
         raise InputError("a detected box is impossible", where=where, expected="finite numbers, sizes of at least 0, a score in 0..1",
             got=repr(record)[:120])  # fmt: skip
-    name, across, down = sizes.get(given, (str(given), 1.0, 1.0))
     if sizes and given not in sizes:
         raise InputError(
             "a detected box belongs to no image", where=where, got=str(given), expected="an id of the images"
