@@ -15,9 +15,8 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.bench import run as bench
 from mudg.bench import shift
-from mudg.bench.chain import LONGER, method_fit
-from mudg.bench.paper_tables import RECORDED, TABLES
-from mudg.bench.shift import rows_of
+from mudg.bench.papers import RECORDED, TABLES
+from mudg.bench.rows import LONGER, method_fit, shift_rows
 from mudg.cli import parse
 from mudg.data.city.config import CityConfig
 from mudg.data.city.logs import LogRules
@@ -164,7 +163,7 @@ def test_a_table_whose_rows_fit_nothing_takes_no_settings_of_fits(weights, tmp_p
 
 
 def test_a_method_for_comparison_keeps_what_the_preset_sets_and_it_does_not_know():
-    fits = {row.name: row.fit for row in rows_of(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")}
+    fits = {row.name: row.fit for row in shift_rows(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")}
     assert (fits["mudg_s"].poses.learn, fits["pvg"].poses.learn) == (True, False)
     assert fits["pvg"].start == fits["mudg_s"].start and fits["pvg"].iterations == fits["mudg_s"].iterations == 30_000
     with pytest.raises(UsageError, match="knows nothing of it"):

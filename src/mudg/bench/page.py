@@ -1,10 +1,12 @@
-"""The page of ``mudg bench shift``: tables, and per log and trajectory one video that holds all methods side by side.
+"""Pages of benchmarks: tables, and pictures or videos that hold all methods side by side.
 
-The videos are files beside the page (``<log>/film/<trajectory>.mp4``); the page itself loads nothing else.
+Pages of ``shift`` and ``paper`` name their pictures, which are files beside them (``<log>/film/<trajectory>.jpg`` and ``.mp4``); those of
+``real`` and ``edit`` hold them.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +18,6 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Trajectory
-from mudg.bench import shift_tables as tables
 from mudg.core.pictures import resize_area
 from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
@@ -24,7 +25,6 @@ from mudg.report import html
 from mudg.report.page import FPS, shift_title
 from mudg.report.panels import panel_grid, panel_size
 
-SHOWN: Final = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
 PANEL_WIDTH: Final = 320
 ENCODING: Final = Encoding(FPS, first_crf=29, last_crf=41, preset="veryfast")
 VIDEO_BYTES: Final = 900 * 1024
@@ -32,9 +32,6 @@ VIDEO_BYTES: Final = 900 * 1024
 ROWS: Final = {"rgb": "colour", "error": "colour error", "depth": "depth"}
 """Rows of a video, and their titles."""
 _OUTPUT: Final = VerbOutput("film", 1, ("*.mp4", "*.jpg"))
-
-
-# ---- videos ----
 
 
 def film(
@@ -51,22 +48,19 @@ def film(
     named = {f"{name} {n}" if n else name: folder for name, of in folders.items() for n, folder in enumerate(of)}
     refuse_overlap(out, named)
     inputs = {name: store.digest(folder) for name, folder in named.items()}
-    asked: dict[str, Any] = {"columns": list(views), "trajectories": [path.name for path in paths], "panel_width_px": PANEL_WIDTH}
-    folder = RunDir.open(out, _OUTPUT, asked if videos else {**asked, "videos": False}, inputs, overwrite)
+    settings: dict[str, Any] = {"columns": list(views), "trajectories": [path.name for path in paths], "panel_width_px": PANEL_WIDTH}
+    folder = RunDir.open(out, _OUTPUT, settings if videos else {**settings, "videos": False}, inputs, overwrite)
     if folder.complete:
         return folder.reused()
-    found = {
-        name: {k: v for one in of for k, v in list_observation_sets(one).items()} for name, of in folders.items()
-    }
+    listed = {name: {k: v for one in of for k, v in list_observation_sets(one).items()} for name, of in folders.items()}
     playable = videos and bool(video_encoders())
     for path in paths:
-        sets = {name: read_observations(listed[path.name]) for name, listed in found.items() if path.name in listed}
+        sets = {name: read_observations(sets[path.name]) for name, sets in listed.items() if path.name in sets}
         if "truth" in views and "truth" not in sets:
             raise InputError("no ground truth to show", where=f"{views['truth']}: {path.name}")
         if not sets:
             continue
-        numbers = range(len(path)) if playable else [len(path) // 2]
-        pictures = list(_frames(sets, list(views), numbers))
+        pictures = list(_frames(sets, list(views), range(len(path)) if playable else [len(path) // 2]))
         if playable:
             store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda made=pictures: made, ENCODING, VIDEO_BYTES))
         middle = pictures[len(pictures) // 2]
@@ -85,39 +79,28 @@ def _frames(sets: Mapping[str, ObservationSet], order: Sequence[str], frames: Se
         yield panel_grid(seen, rows, size, seen.get("truth"))
 
 
-# ---- the page ----
+def inside(path: Path) -> str:
+    """A picture as a data address."""
+    return "data:image/jpeg;base64," + base64.b64encode(store.read_bytes(path)).decode("ascii")
 
 
-def page(doc: Mapping[str, Any]) -> str:
-    """The whole page from what ``bench.json`` holds."""
-    settings = doc["settings"]
-    *places, mean = tables.places_of(doc)
-    names = [row["name"] for row in doc["methods"]]
-    return html.render(
-        "shift.html.j2", title=f"Off the recorded path: {tables.logs_text(doc)}, {settings['list']} list", kicker="mudg bench shift",
-        lead=f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {settings['iterations']} iterations "
-        f"per fit, {tables.further_of(settings)}. Means over logs and both sides of the path.",
-        comparisons=[[c["title"], *tables.compared_text(c), c["kind"], c["logs"]] for c in doc["comparisons"]],
-        score_heads=["method", *(heading for _, heading, _ in tables.COLUMNS)],
-        places=[
-            {"title": tables.place_title(doc, place), "rows": [[n, *tables.score_cells(doc, n, place, with_error=True)] for n in names]}
-            for place in (mean, *places)
-        ],
-        log_heads=tables.FACTS, logs=[tables.facts_of(entry) for entry in doc["logs"]], **_video_values(doc),
-    )  # fmt: skip
+def wall(title: str, pictures: Mapping[str, Path], notes: Sequence[str] = ()) -> dict[str, Any]:
+    """Pictures side by side, by title, which a page holds."""
+    return {"title": title, "notes": notes, "cells": [{"title": name, "src": inside(path)} for name, path in pictures.items()]}
 
 
-def _video_values(doc: Mapping[str, Any]) -> dict[str, Any]:
-    """The videos, and what the reader can choose among them; the largest shift to the left comes first."""
-    videos = [(entry["log"], name) for entry in doc["logs"] for name in entry["films"]]
-    names = sorted({name for _, name in videos}, key=_shift_of)
+def films(doc: Mapping[str, Any], columns: Sequence[str], *, videos: bool, exact: bool = True, choice: bool = False) -> dict[str, Any]:
+    """Values of a page's section with the films of all logs; with a choice among them, the largest shift to the left comes first."""
+    named = [(entry["log"], name) for entry in doc["logs"] for name in entry["films"]]
+    titles = {name: shift_title(_shift_of(name), name) if choice else name for _, name in named}
+    names = sorted(titles, key=_shift_of)
     return {
-        "videos": [{"log": log, "name": name, "title": _shift_title(name)} for log, name in videos],
-        "columns": ["truth", *(r["name"] for r in doc["methods"] if r["name"] in SHOWN)],
-        "panel_rows": ROWS.values(),
-        "log_choices": [entry["log"] for entry in doc["logs"] if entry["films"]],
-        "shift_choices": [{"name": name, "title": _shift_title(name), "selected": name == names[-1]} for name in names],
-    }
+        "title": "Rendered views", "columns": columns, "videos": videos,
+        "panel_rows": [title for row, title in ROWS.items() if row != "error" or exact],
+        "films": [{"log": log, "name": name, "title": titles[name]} for log, name in named],
+        "log_choices": [entry["log"] for entry in doc["logs"] if entry["films"]] if choice else [],
+        "shift_choices": [{"name": name, "title": titles[name], "selected": name == names[-1]} for name in names] if choice else [],
+    }  # fmt: skip
 
 
 def _shift_of(name: str) -> float:
@@ -125,5 +108,14 @@ def _shift_of(name: str) -> float:
     return float(shift) if shift else 0.0
 
 
-def _shift_title(name: str) -> str:
-    return shift_title(_shift_of(name), name)
+def render(title: str, command: str, lead: str, sections: Sequence[Mapping[str, Any]], footer: str = "") -> str:
+    """A page.
+
+    Args:
+        command: what makes it. lead: first sentence. sections: each with ``title``, and any of ``tables`` (``report.tables.Table``),
+            ``notes`` above and ``below`` them, the values of `films`, and ``walls``. footer: where the pictures lie.
+    """
+    usual = {"tables": (), "notes": (), "below": (), "films": (), "walls": (), "log_choices": (), "shift_choices": ()}
+    return html.render(
+        "bench.html.j2", title=title, kicker=command, lead=lead, footer=footer, sections=[{**usual, **section} for section in sections]
+    )
