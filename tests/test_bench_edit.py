@@ -38,9 +38,9 @@ def test_the_summary_leaves_out_what_no_frame_shows_and_takes_dark_and_bright_al
     row = {"psnr": 20.0, "psnr_recorded": 30.0, "perceptual": 0.2, "perceptual_recorded": 0.1}
     rows = [{"way": way, **row, "light": light} for way in edit.LIGHTS for light in (2.0, 0.5)]
     rows.append({"way": "as recorded", **dict.fromkeys(row), "light": None})
-    (one, two) = edit.replaced_summary(rows)
+    (one, two) = edit.REPLACED.summary(rows)
     assert one["light"] == pytest.approx(2.0) and (one["cities"], two["cities"]) == (2, 2)
-    assert "| as recorded | 20.00 | 30.00 | 0.2000 | 0.1000 | 2.0x | 2.00x |" in edit.replaced_table(rows)
+    assert "| as recorded | 20.00 | 30.00 | 0.2000 | 0.1000 | 2.0x | 2.00x |" in edit.REPLACED.table([one, two])
 
 
 @pytest.mark.slow

@@ -25,8 +25,10 @@ all. `insert` takes the object away and puts its own asset in 3 m ahead, so that
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -52,7 +54,7 @@ from mudg.data.edits import parse_edits
 from mudg.data.scene import read_label, read_scene
 from mudg.models.scene.edited import linear_of
 from mudg.models.scene.model import SceneModel, compose
-from mudg.report.tables import markdown_table
+from mudg.report.tables import cells, markdown_table
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig
 from mudg.stages.editing.assets import complete_asset, write_asset
@@ -110,52 +112,43 @@ class EditCase:
         return self.world.instance_of(self.name)
 
 
-@dataclass(frozen=True)
-class _Cities:
-    """The cities of a benchmark, each fitted at most once. ``out``: its folder."""
-
-    config: BenchConfig
-    out: Path
-    cases: dict[int, EditCase] = field(default_factory=dict)
-
-    def case(self, city: int) -> EditCase:
-        """A fitted city."""
-        if city not in self.cases:
-            self.cases[city] = case_of(self.config, city, self.out)
-        return self.cases[city]
-
-    def rows(self, name: str, measure: Callable[[EditCase], list[dict[str, Any]]], city: int) -> list[dict[str, Any]]:
-        """Rows of a city, measured if an interrupted benchmark has not."""
-        return finished(self.out / "rows" / f"{city}_{name}.json", lambda: measure(self.case(city)))
-
-
 def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     """The edits of fitted scenes, vehicles of other cities, and, if asked for, what a diffusion model adds; numbers and tables. Cities that
     an interrupted run finished are kept."""
-    names = bench_poses.LISTS[config.cities][: config.count]
-    cities, rows, given, repaired = _Cities(config, out), [], [], []
-    with log.task("editing", len(names)) as bar:
-        for city in names:
-            rows += cities.rows("edits", lambda case: [_edited_row(case, name, text) for name, text in EDITS.items()], city)
-            bar.advance()
-    result = {"cities": list(names), "iterations": config.pose_iterations, "rows": rows, "summary": summary(rows)}
-    text = _table(result)
-    if len(names) > 1:
-        with log.task("inserting vehicles of other cities", len(names)) as bar:
-            for city, giver in zip(names, [*names[1:], *names[:1]], strict=True):
-                given += cities.rows("insert", lambda case, g=giver: _replaced_rows(case, cities.case(g), out), city)
-                bar.advance()
-        result["insert"] = {"rows": given, "summary": replaced_summary(given)}
-        text += replaced_table(given)
-    if config.harmonize:
-        with log.task("editing with diffusion", len(names)) as bar:
+    names, cases = bench_poses.LISTS[config.cities][: config.count], {}
+
+    def case(city: int) -> EditCase:
+        if city not in cases:
+            cases[city] = case_of(config, city, out)
+        return cases[city]
+
+    def rows(task: str, parts: Mapping[str, Callable[[int], list[dict[str, Any]]]]) -> list[dict[str, Any]]:
+        found = []
+        with log.task(task, len(names)) as bar:
             for city in names:
-                for edit in REPAIRED_EDITS:
-                    name = f"{edit.replace(' ', '_')}_diffusion"
-                    repaired += cities.rows(name, lambda case, e=edit: _repaired_rows(config, case, e, out), city)
+                for name, measured in parts.items():
+                    found += finished(out / "rows" / f"{city}_{name}.json", partial(measured, city))
                 bar.advance()
-        result["diffusion"] = {"rows": repaired, "summary": _repaired_summary(repaired)}
-        text += _repaired_table(repaired)
+        return found
+
+    edited = rows("editing", {"edits": lambda city: [_edited_row(case(city), name, text) for name, text in EDITS.items()]})
+    first = dict.fromkeys(("edit", "cities", "outside"))  # the order of these in bench.json
+    means = [{**first, **row} for row in EDITED.summary(edited)]
+    result = {"cities": list(names), "iterations": config.pose_iterations, "rows": edited, "summary": means}
+    title = EDITED.title.format(cities=len(names), iterations=config.pose_iterations)
+    text = replace(EDITED, title=title).table(means)
+    if len(names) > 1:
+        giver = dict(zip(names, [*names[1:], *names[:1]], strict=True))
+        replaced = rows("inserting vehicles of other cities", {"insert": lambda city: _replaced_rows(case(city), case(giver[city]), out)})
+        result["insert"] = {"rows": replaced, "summary": REPLACED.summary(replaced)}
+        text += REPLACED.table(result["insert"]["summary"])
+    if config.harmonize:
+        parts = {f"{edit.replace(' ', '_')}_diffusion": edit for edit in REPAIRED_EDITS}
+        repaired = rows("editing with diffusion", {
+            name: lambda city, edit=edit: _repaired_rows(config, case(city), edit, out) for name, edit in parts.items()
+        })  # fmt: skip
+        result["diffusion"] = {"rows": repaired, "summary": REPAIRED.summary(repaired)}
+        text += REPAIRED.table(result["diffusion"]["summary"])
     return result, text
 
 
@@ -275,34 +268,62 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _means(
-    rows: Iterable[Mapping[str, Any]], names: Mapping[str, str], keys: Sequence[str], place: str = "inside"
-) -> dict[str, Any] | None:
-    """Means by key over the cities whose row of these names has a number at a place; None where there is no such city."""
-    mine = [row for row in rows if names.items() <= row.items() and row[place] is not None]
-    return {**names, "cities": len(mine), **{key: _mean(row[key] for row in mine) for key in keys}} if mine else None
+# ---- summaries ----
 
 
-def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Means per edit over the cities in which it changed something."""
-    keys = ("outside", "inside", "inside_before", "vehicle", "vehicle_before", "uncovered", "overlap", "overlap_before")
-    return [found for name in EDITS if (found := _means(rows, {"edit": name}, keys))]
+@dataclass(frozen=True)
+class Part:
+    """A part of the benchmark: what its rows are grouped by, with values in order, the title and headings of its table, and
+    its numbers as text. A city counts where the first of ``numbers`` exists."""
+
+    title: str
+    heads: tuple[str, ...]
+    groups: Mapping[str, Sequence[str]]
+    numbers: Mapping[str, str]
+
+    def summary(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Means over the cities that count; of light the root mean square factor."""
+        made, first = [], next(iter(self.numbers))
+        for values in itertools.product(*self.groups.values()):
+            names = dict(zip(self.groups, values, strict=True))
+            mine = [row for row in rows if names.items() <= row.items() and row[first] is not None]
+            if mine:
+                found = {key: [row[key] for row in mine] for key in self.numbers if key != "ratio"}
+                means = {key: _mean(numbers) for key, numbers in found.items()}
+                if "light" in means:
+                    means["light"] = float(np.exp(np.sqrt(np.mean(np.log(found["light"]) ** 2))))
+                made.append({**names, "cities": len(mine), **means})
+        return made
+
+    def table(self, summary: Sequence[Mapping[str, Any]]) -> str:
+        """The summary as text."""
+        rows = []
+        for row in summary:
+            ratio = {"ratio": row["perceptual"] / row["perceptual_recorded"]} if "ratio" in self.numbers else {}
+            rows.append([*(row[name] for name in self.groups), *cells({**row, **ratio}, self.numbers)])
+        return "\n".join([self.title, "", *markdown_table(self.heads, rows)]) + "\n"
 
 
-def _cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
-    """Values as text; `-`: there is no such number."""
-    return ["-" if row[key] is None else form.format(row[key]) for key, form in forms.items()]
-
-
-def _table(result: Mapping[str, Any]) -> str:
-    """The summary as text."""
-    heads = ["edit", "changed pixels [dB]", "unedited", "vehicle [dB]", "unedited", "uncovered [dB]", "outside changed", "overlap",
-             "unedited"]  # fmt: skip
-    forms = {**dict.fromkeys(("inside", "inside_before", "vehicle", "vehicle_before", "uncovered"), "{:.2f}"), "outside": "{:.2%}",
-             "overlap": "{:.2f}", "overlap_before": "{:.2f}"}  # fmt: skip
-    title = f"# Edits of {len(result['cities'])} fitted cities ({result['iterations']} steps) against the cities drawn again"
-    rows = [[row["edit"], *_cells(row, forms)] for row in result["summary"]]
-    return "\n".join([title, "", *markdown_table(heads, rows)]) + "\n"
+_PIXELS: Final = ("inside", "inside_before", "vehicle", "vehicle_before", "uncovered")
+EDITED: Final = Part(
+    "# Edits of {cities} fitted cities ({iterations} steps) against the cities drawn again",
+    ("edit", "changed pixels [dB]", "unedited", "vehicle [dB]", "unedited", "uncovered [dB]", "outside changed", "overlap", "unedited"),
+    {"edit": tuple(EDITS)},
+    {**dict.fromkeys(_PIXELS, "{:.2f}"), "outside": "{:.2%}", "overlap": "{:.2f}", "overlap_before": "{:.2f}"},
+)
+REPLACED: Final = Part(
+    "\n## Vehicles of other cities",
+    ("inserted", "vehicle [dB]", "recorded there", "perceptual", "recorded there", "ratio", "light off by"),
+    {"way": tuple(LIGHTS)},
+    {"psnr": "{:.2f}", "psnr_recorded": "{:.2f}", "perceptual": "{:.4f}", "perceptual_recorded": "{:.4f}", "ratio": "{:.1f}x",
+     "light": "{:.2f}x"},
+)  # fmt: skip
+REPAIRED: Final = Part(
+    "\n## With a diffusion model",
+    ("edit", "frames", "changed pixels [dB]", "vehicle [dB]", "uncovered [dB]", "perceptual", "outside changed"),
+    {"edit": tuple(REPAIRED_EDITS), "way": REPAIRS},
+    {**dict.fromkeys(("inside", "vehicle", "uncovered"), "{:.2f}"), "perceptual": "{:.4f}", "outside": "{:.2%}"},
+)
 
 
 # ---- vehicles of other cities ----
@@ -342,27 +363,6 @@ def vehicle_scores(made: Sequence[Seen], recorded: Sequence[Seen]) -> dict[str, 
         found["perceptual" + end] = _mean(distance_in(image, true, mask) for image, true, mask in seen)
     light = [np.concatenate([linear_of(one[which][one[2]]) for one in made]).mean() for which in (0, 1)] if made else None
     return {**found, "light": None if light is None else float(light[1] / light[0])}
-
-
-def replaced_summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Means per way over the cities that show the vehicle; of light the root mean square factor."""
-    keys, made = ("psnr", "psnr_recorded", "perceptual", "perceptual_recorded"), []
-    for way in LIGHTS:
-        means = _means(rows, {"way": way}, keys, "psnr")
-        if means is not None:
-            lights = [row["light"] for row in rows if row["way"] == way and row["psnr"] is not None]
-            made.append({**means, "light": float(np.exp(np.sqrt(np.mean(np.log(lights) ** 2))))})
-    return made
-
-
-def replaced_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The summary as text."""
-    heads = ["inserted", "vehicle [dB]", "recorded there", "perceptual", "recorded there", "ratio", "light off by"]
-    forms = {"psnr": "{:.2f}", "psnr_recorded": "{:.2f}", "perceptual": "{:.4f}", "perceptual_recorded": "{:.4f}", "ratio": "{:.1f}x",
-             "light": "{:.2f}x"}  # fmt: skip
-    shown = [{**row, "ratio": row["perceptual"] / row["perceptual_recorded"]} for row in replaced_summary(rows)]
-    cells = [[row["way"], *_cells(row, forms)] for row in shown]
-    return "\n".join(["", "## Vehicles of other cities", "", *markdown_table(heads, cells)]) + "\n"
 
 
 # ---- with a diffusion model ----
@@ -418,17 +418,3 @@ def _never_there(config: BenchConfig, case: EditCase, world: CityWorld, out: Pat
         write_world(world, folder)
     scene, settings = read_scene(folder), bench_poses.fit_settings(config, "fixed")
     return bench_poses.fitted(scene, bench_poses.cloud_of(scene), settings, out / "fits" / f"{case.city}_without").model
-
-
-def _repaired_summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Means per edit and way over the cities in which the edit changes something."""
-    keys = ("inside", "vehicle", "uncovered", "perceptual", "outside")
-    return [found for edit in REPAIRED_EDITS for way in REPAIRS if (found := _means(rows, {"edit": edit, "way": way}, keys))]
-
-
-def _repaired_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The summary as text."""
-    heads = ["edit", "frames", "changed pixels [dB]", "vehicle [dB]", "uncovered [dB]", "perceptual", "outside changed"]
-    forms = {**dict.fromkeys(("inside", "vehicle", "uncovered"), "{:.2f}"), "perceptual": "{:.4f}", "outside": "{:.2%}"}
-    cells = [[row["edit"], row["way"], *_cells(row, forms)] for row in _repaired_summary(rows)]
-    return "\n".join(["", "## With a diffusion model", "", *markdown_table(heads, cells)]) + "\n"

@@ -44,7 +44,7 @@ from mudg.data.edits import EditScript, parse_edits
 from mudg.data.exporters.video import jpeg_bytes
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
-from mudg.report.tables import Table, markdown_table
+from mudg.report.tables import Table, cells, markdown_table
 from mudg.stages.config import BenchConfig
 from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.assets import asset_from, read_asset, write_asset
@@ -265,7 +265,7 @@ def _pictures(frames: int, out: Path, name: str) -> Shown:
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
     """A row of the table as text; `-`: there is no such number."""
-    return [row["run"], row["edit"], *("-" if row[key] is None else form.format(row[key]) for key, form in FORMS.items())]
+    return [row["run"], row["edit"], *cells(row, FORMS)]
 
 
 def markdown(doc: Mapping[str, Any]) -> str:

@@ -44,7 +44,7 @@ def film(
             no row of errors.
         videos: off: only the pictures, of the middle view and in full size.
     """
-    folders = {name: (given,) if isinstance(given, Path) else tuple(given) for name, given in views.items()}
+    folders = {name: (folder,) if isinstance(folder, Path) else tuple(folder) for name, folder in views.items()}
     named = {f"{name} {n}" if n else name: folder for name, of in folders.items() for n, folder in enumerate(of)}
     refuse_overlap(out, named)
     inputs = {name: store.digest(folder) for name, folder in named.items()}
@@ -62,7 +62,7 @@ def film(
             continue
         pictures = list(_frames(sets, list(views), range(len(path)) if playable else [len(path) // 2]))
         if playable:
-            store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda made=pictures: made, ENCODING, VIDEO_BYTES))
+            store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda frames=pictures: frames, ENCODING, VIDEO_BYTES))
         middle = pictures[len(pictures) // 2]
         poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2) if videos else middle
         store.atomic_write(folder.path / f"{path.name}.jpg", jpeg_bytes(poster, quality=75))

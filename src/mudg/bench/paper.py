@@ -149,8 +149,8 @@ def run(
 
 def _weights_of(config: ScoreConfig) -> dict[str, str]:
     """Files and folders that a score reads: setting -> path."""
-    found = {name: value for name, value in configuration.to_dict(config).items() if isinstance(value, str) and value}
-    return {name: value for name, value in found.items() if name.endswith("weights") or Path(value).exists()}
+    result = {name: value for name, value in configuration.to_dict(config).items() if isinstance(value, str) and value}
+    return {name: value for name, value in result.items() if name.endswith("weights") or Path(value).exists()}
 
 
 def further_columns(exact: bool) -> tuple[Column, ...]:
@@ -180,8 +180,8 @@ def _value(column: Column, rows: Sequence[Mapping[str, Any] | None]) -> dict[str
     if reasons or None in values:
         return {"value": _reason(column, reasons[0] if reasons else "not produced")}
     counts = [row.get(column.counts, {}) if column.counts else row for row in rows if row is not None]
-    found = {"value": fmean(values), "n": sum(int(of["n" if column.counts else "views"]) for of in counts)}
-    return found | ({"n_reference": sum(int(of["n_reference"]) for of in counts)} if column.counts else {})
+    result = {"value": fmean(values), "n": sum(int(of["n" if column.counts else "views"]) for of in counts)}
+    return result | ({"n_reference": sum(int(of["n_reference"]) for of in counts)} if column.counts else {})
 
 
 def _reason(column: Column, reason: str) -> str:
@@ -193,28 +193,28 @@ def _reason(column: Column, reason: str) -> str:
 
 def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[Column]) -> Values:
     """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views alone."""
-    found: Values = {}
+    result: Values = {}
     for column in columns:
         entry = SET_METRICS.get(column.key, "")
         floors = {f["trajectory"]: f for document in documents for f in document.get(entry, {}).get("floors", [])}
         known = [floors[name] for name in names if name in floors]
         if known and len(known) == len(names):
             value = fmean(f[column.key] for f in known)
-            found[column.key] = {"value": value, **{key: sum(f[key] for f in known) for key in ("n", "n_reference")}}
+            result[column.key] = {"value": value, **{key: sum(f[key] for f in known) for key in ("n", "n_reference")}}
         else:
             missing = SELF if column.key in BY_DEFINITION else NOT_COMPUTED if entry else NO_TRUTH
-            found[column.key] = {"value": _reason(column, missing)}
-    return found
+            result[column.key] = {"value": _reason(column, missing)}
+    return result
 
 
 def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """How distances of sets were made: networks, digests of their weights, resize rules, epsilon, clips."""
-    found: dict[str, Any] = {"depth_rule": documents[0]["rules"][3] if len(documents[0]["rules"]) > 3 else ""}
+    result: dict[str, Any] = {"depth_rule": documents[0]["rules"][3] if len(documents[0]["rules"]) > 3 else ""}
     for document in documents:
         for entry in dict.fromkeys(SET_METRICS.values()):
             if document.get(entry):
-                found[entry] = {name: value for name, value in document[entry].items() if name not in ("floors", "sets")}
-    return found
+                result[entry] = {name: value for name, value in document[entry].items() if name not in ("floors", "sets")}
+    return result
 
 
 # ---- sets of all logs ----
@@ -226,7 +226,7 @@ def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], 
     Args:
         documents: folder of scores -> its metrics.json, one method each. names: trajectories of the place. out: of the benchmark.
     """
-    found: Files = {}
+    result: Files = {}
     for entry in POOLED:
         sets = {
             record["trajectory"]: [(folder / FEATURES_FOLDER / record[part]).relative_to(out).as_posix() for part in ("made", "reference")]
@@ -235,8 +235,8 @@ def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], 
         known = [sets[name] for name in names if name in sets]
         if known and len(known) == len(names):
             made, reference = zip(*known, strict=True)
-            found[entry] = {"made": list(made), "reference": list(dict.fromkeys(reference))}
-    return found
+            result[entry] = {"made": list(made), "reference": list(dict.fromkeys(reference))}
+    return result
 
 
 def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, Values]]:
@@ -245,7 +245,7 @@ def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, 
     Args:
         logs: per log its facts, with ``features[row][place]`` as from `files_at`. out: folder of the benchmark.
     """
-    found: dict[str, dict[str, Values]] = {}
+    result: dict[str, dict[str, Values]] = {}
     for row, places in {row: of for entry in logs for row, of in entry["features"].items()}.items():
         for place in places:
             for entry in POOLED:
@@ -255,14 +255,14 @@ def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, 
                 made, reference = _sets(files, out, row == TRUTH)
                 if min(len(made), len(reference)) < FEWEST:
                     continue
-                cells = found.setdefault(row, {}).setdefault(place, {})
+                cells = result.setdefault(row, {}).setdefault(place, {})
                 if entry == "videos":
                     cells["fvd"] = {"mean": compared(made, reference)["fvd"], "standard_error": None}
                 else:
                     both = distances(made, reference)
                     cells["fid"] = {"mean": round(both.fid, 6), "standard_error": None}
                     cells["kid"] = {"mean": round(both.kid, 6), "standard_error": both.kid_standard_error}
-    return found
+    return result
 
 
 def _sets(
@@ -331,8 +331,8 @@ def _cell(
         return {"reason": reasons[0] + few}
     numbers = [one["value"] for one in values]
     counts = {key: [one[key] for one in values] for key in ("n", "n_reference") if key in values[0]}
-    found = {"mean": fmean(numbers), "standard_error": standard_error(fmean, numbers), "logs": len(numbers), **counts}
-    return found if pooled is None else {**found, **pooled, "mean_over_logs": fmean(numbers)}
+    result = {"mean": fmean(numbers), "standard_error": standard_error(fmean, numbers), "logs": len(numbers), **counts}
+    return result if pooled is None else {**result, **pooled, "mean_over_logs": fmean(numbers)}
 
 
 def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: Column) -> None:
@@ -455,12 +455,12 @@ def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator
 
 
 def _printed(doc: Mapping[str, Any], row: str, place: str, key: str) -> Cell:
-    found, column = doc["cells"][row][place][key], _columns(doc)[key]
-    if "mean" not in found:
-        return Cell(found["reason"], reason=found["reason"])
-    error = found["standard_error"]
+    result, column = doc["cells"][row][place][key], _columns(doc)[key]
+    if "mean" not in result:
+        return Cell(result["reason"], reason=result["reason"])
+    error = result["standard_error"]
     behind = "" if error is None else f" ({_digits(error, column)})"
-    return Cell(_digits(found["mean"], column) + behind, row in doc["best"][place][key])
+    return Cell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
 
 
 def _digits(value: float, column: Mapping[str, Any]) -> str:
@@ -509,10 +509,10 @@ def as_csv(doc: Mapping[str, Any]) -> str:
         rows += [[PUBLISHED, row["title"], row["source"], place, key, value, *[""] * 6] for place, key, value in row["values"]]
     for row in doc["rows"]:
         for place, of in doc["cells"][row["name"]].items():
-            for key, found in of.items():
-                numbers = ["" if (value := found.get(name)) is None else f"{value:.6g}" for name in ("mean", "standard_error")]
-                counts = [sum(found[name]) if name in found else "" for name in ("n", "n_reference")]
-                last = [found.get("logs", ""), *counts, found.get("reason", ""), int(row["name"] in doc["best"][place][key])]
+            for key, result in of.items():
+                numbers = ["" if (value := result.get(name)) is None else f"{value:.6g}" for name in ("mean", "standard_error")]
+                counts = [sum(result[name]) if name in result else "" for name in ("n", "n_reference")]
+                last = [result.get("logs", ""), *counts, result.get("reason", ""), int(row["name"] in doc["best"][place][key])]
                 rows.append(["ours" if row["method"] else "anchor", row["name"], "", place, key, *numbers, *last])
     return csv_text("kind row source place metric value standard_error logs n n_reference reason best".split(), rows)
 

@@ -172,12 +172,12 @@ def read_papers(text: str, where: str) -> Papers:
 def _printed(source: str, cells: str, rows: str) -> list[dict[str, Any]]:
     """Published rows from ``title | numbers`` in the order of ``cells``, each ``place:column``; ``-``: not printed."""
     keys = [tuple(cell.split(":")) for cell in cells.split()]
-    found = []
+    records = []
     for line in rows.strip().splitlines():
         title, _, numbers = line.partition("|")
         values = [(*key, float(word)) for key, word in zip(keys, numbers.split(), strict=True) if word != "-"]
-        found.append({"title": title.strip(), "source": source, "values": values})
-    return found
+        records.append({"title": title.strip(), "source": source, "values": values})
+    return records
 
 
 PAPERS: Final = read_papers(store.read_text(FILE), FILE.name)

@@ -136,8 +136,8 @@ def _identity(source: Path) -> str:
 
 def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
     """Segments of the table's list that no recorded log belongs to; none where cities are scored."""
-    given = " ".join(_identity(log.source) for log in logs if isinstance(log, RecordedLog))
-    return [one.segment for one in SCENE_LISTS.get(table.scenes, ()) if given and one.segment not in given]
+    identities = " ".join(_identity(log.source) for log in logs if isinstance(log, RecordedLog))
+    return [one.segment for one in SCENE_LISTS.get(table.scenes, ()) if identities and one.segment not in identities]
 
 
 def names_of(sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")) -> dict[str, Path]:
@@ -148,15 +148,15 @@ def names_of(sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "ben
     """
     if not sources:
         raise UsageError("no log was given", expected="mudg bench real LOG... --out FOLDER")
-    found: dict[str, Path] = {}
+    named: dict[str, Path] = {}
     for source in map(Path, sources):
         last = source.resolve().stem if source.suffix == ".zip" else source.resolve().name
         name = _NAME.sub("_", last).strip("._-") or "log"
-        if name in found or name in pages:
+        if name in named or name in pages:
             raise UsageError("two logs have the same name", where=str(source), got=name,
                              remedy="rename one, or prepare it with mudg ingest in a folder of another name")  # fmt: skip
-        found[name] = source
-    return found
+        named[name] = source
+    return named
 
 
 # ---- scenes ----
@@ -221,15 +221,15 @@ def _write_shown(
         raise InputError("the log has fewer frames than the table asks for", where=str(whole), expected=f"frames {first} to {last}",
                          got=f"{len(times)} frames of camera {camera}", remedy="give the whole log, or choose --frames")  # fmt: skip
     moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
-    kept = [
+    chosen = [
         frame for frame in scene.frames
         if first <= moment(frame.view.time_s) <= last and (not table.front_only or frame.view.camera.name == camera)
     ]  # fmt: skip
     sweeps = [sweep.id for sweep in scene.sweeps if first <= moment(sweep.time_s) <= last]
-    groups = [[f.id for f in kept if moment(f.view.time_s) == number] for number in range(first, last + 1)]
+    groups = [[f.id for f in chosen if moment(f.view.time_s) == number] for number in range(first, last + 1)]
     held = [name for name, part in holdout_split(groups, table.held_out_every).items() if part == "test"]
-    write_part(scene, folder.path, {frame.id for frame in kept}, sweeps, held_out=held)
-    folder.finish({"frames": len(kept), "held_out": len(held)})
+    write_part(scene, folder.path, {frame.id for frame in chosen}, sweeps, held_out=held)
+    folder.finish({"frames": len(chosen), "held_out": len(held)})
     return folder.path
 
 

@@ -96,7 +96,7 @@ def run(
     }  # fmt: skip
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
-        of_log = {name: [found for job, found in zip(jobs, measured) if job.out.name == name] for name in scenes}
+        of_log = {name: [result for job, result in zip(jobs, measured) if job.out.name == name] for name in scenes}
         return document([_entry(name, scenes[name], of_log[name]) for name in scenes], list(map(_row_values, rows)), protocols, settings)
 
     return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
@@ -152,17 +152,17 @@ class SplitJob:
             return {"split": self.split.name, "held_out": {}, "diffusion": {}, "protocols": left_out}
         self.write_seen(whole, held)
         chain, cameras = self.chain(), self.cameras(whole, held)
-        truths, found = {}, {}
+        truths, result = {}, {}
         for protocol in self.protocols:
             truth = chain.step(
                 write_targets, protocol, self.source, chain.scene, held.frames, cameras, self.out / "truth" / protocol.name
             )
             targets = read_targets(truth)
-            found[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
+            result[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
             if len(targets):
                 truths[protocol.name] = truth
             else:
-                found[protocol.name]["left_out"] = targets.reason
+                result[protocol.name]["left_out"] = targets.reason
         if truths:
             chain.fuse()
         used: dict[str, dict[str, str]] = {}
@@ -175,8 +175,8 @@ class SplitJob:
                     write_scores, protocol, self.source, truths[protocol.name], views, self.out / "score" / protocol.name / row.name,
                     device=self.config.device,
                 )  # fmt: skip
-                found[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
-        return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": found}
+                result[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
+        return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": result}
 
     def write_seen(self, whole: Scene, held: HeldOut) -> None:
         """Write what the methods see: the shown frames and sweeps; these with the labels that they lack; the same with the places of
@@ -280,7 +280,7 @@ def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str
         "log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene), "cameras": cameras,
         "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks), "held_out": {s["split"]: s["held_out"] for s in splits},
         "diffusion": {s["split"]: s["diffusion"] for s in splits},
-        "protocols": {protocol: found for s in splits for protocol, found in s["protocols"].items()},
+        "protocols": {protocol: result for s in splits for protocol, result in s["protocols"].items()},
     }  # fmt: skip
 
 
@@ -289,12 +289,12 @@ def document(
 ) -> dict[str, Any]:
     """Everything ``bench.json`` holds: per protocol, log and method the values by place and their mean; the means over the logs that have
     a number; and differences (or ratios) to the fit without diffusion."""
-    names, found = [row["name"] for row in rows], {}
+    names, result = [row["name"] for row in rows], {}
     for protocol in protocols:
         entries = {entry["log"]: entry["protocols"][protocol.name] for entry in logs}
         counted = [entry["values"] for entry in entries.values() if "left_out" not in entry]
         pooled = {name: mean_values([values[name]["mean"] for values in counted], protocol.columns) for name in names}
-        found[protocol.name] = {
+        result[protocol.name] = {
             "row": asdict(protocol), "logs": entries, "pooled": pooled,
             "left_out": {log: entry["left_out"] for log, entry in entries.items() if "left_out" in entry},
             "against": {
@@ -303,7 +303,7 @@ def document(
             },
         }  # fmt: skip
     facts = [{key: value for key, value in entry.items() if key != "protocols"} for entry in logs]
-    return {"schema": 1, "bench": "real", "settings": dict(settings), "methods": list(rows), "logs": facts, "protocols": found}
+    return {"schema": 1, "bench": "real", "settings": dict(settings), "methods": list(rows), "logs": facts, "protocols": result}
 
 
 # ---- text ----
@@ -324,13 +324,13 @@ def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping
 
 def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
     """Sentences about a protocol: what was held out of each log, what was left out, and the colour maps of cameras."""
-    found, lines = doc["protocols"][protocol], []
+    result, lines = doc["protocols"][protocol], []
     for log in doc["logs"]:
-        name, split = log["log"], found["row"]["split"]
-        if name in found["left_out"]:
-            lines.append(f"{name} is left out: {found['left_out'][name]}.")
+        name, split = log["log"], result["row"]["split"]
+        if name in result["left_out"]:
+            lines.append(f"{name} is left out: {result['left_out'][name]}.")
             continue
-        held, facts = log["held_out"].get(split, {}), found["logs"][name]["facts"]
+        held, facts = log["held_out"].get(split, {}), result["logs"][name]["facts"]
         words = [f"{count} view{'' if count == 1 else 's'} of {place}" for place, count in facts["views"].items()]
         if "blocks" in held:
             blocks = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in held["blocks"])
@@ -376,11 +376,11 @@ def markdown(doc: Mapping[str, Any]) -> str:
         "shipped codec, not LPIPS.", "",
         *markdown_table(LOG_HEADS, map(log_cells, doc["logs"])), "",
     ]  # fmt: skip
-    for name, found in doc["protocols"].items():
-        counted = {log: entry["values"] for log, entry in found["logs"].items() if "left_out" not in entry}
+    for name, result in doc["protocols"].items():
+        counted = {log: entry["values"] for log, entry in result["logs"].items() if "left_out" not in entry}
         lines += [f"## {heading_of(doc, name)}", "", *(f"* {note}" for note in notes_of(doc, name)), ""]
         if counted:
-            lines += [*rendered(table_of(doc, name, found["pooled"])), ""]
+            lines += [*rendered(table_of(doc, name, result["pooled"])), ""]
         for log, values in counted.items():
             places = dict.fromkeys(place for of in values.values() for place in of["places"])
             for place in places if len(places) > 1 else ():
@@ -413,8 +413,8 @@ def page_of(doc: Mapping[str, Any], out: Path) -> str:
 
 
 def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
-    found, walls = doc["protocols"][name], []
-    counted = {log: entry for log, entry in found["logs"].items() if "left_out" not in entry}
+    result, walls = doc["protocols"][name], []
+    counted = {log: entry for log, entry in result["logs"].items() if "left_out" not in entry}
     for log, entry in counted.items():
         folders = {"truth": out / log / "truth" / name, **{m: out / log / "score" / name / m for m in entry["values"]}}
         views = store.read_json(folders["truth"] / "targets.json")["views"]
@@ -423,11 +423,11 @@ def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
             shift = f", {view['shift_m']:+g} m" if view["shift_m"] else ""
             pictures = {title: folder / "pictures" / f"{number:06d}.jpg" for title, folder in folders.items()}
             walls.append(pages.wall(f"{log}: {view['frame']}{shift}", pictures))
-    below = next((text for key, text in BELOW.items() if key in found["row"]["maps"]), BELOW[""])
+    below = next((text for key, text in BELOW.items() if key in result["row"]["maps"]), BELOW[""])
     brackets = f"In brackets: difference to {BASE}, or the ratio (x) where lower is better."
     return {
         "title": heading_of(doc, name), "notes": notes_of(doc, name), "walls": walls,
-        "tables": [table_of(doc, name, found["pooled"])] if counted else [], "below": [brackets] * bool(counted) + [below] * bool(walls),
+        "tables": [table_of(doc, name, result["pooled"])] if counted else [], "below": [brackets] * bool(counted) + [below] * bool(walls),
     }  # fmt: skip
 
 

@@ -226,11 +226,11 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         rows = [Row(row.name, row.title, row.method, changes=row.changes) for row in table.rows]
     else:
         known = [name for method in METHODS for name in ((method, LONGER) if method == BASE else (method,))]
-        asked = [name for name in config.methods if name != FILL]
+        methods = [name for name in config.methods if name != FILL]
         if config.methods == usual_methods:
-            asked = [name for name in known if config.continue_fit or name != LONGER]
-        _refuse_unknown(asked, known, some=False)
-        if freevs and "freevs" not in asked:
+            methods = [name for name in known if config.continue_fit or name != LONGER]
+        _refuse_unknown(methods, known, some=False)
+        if freevs and "freevs" not in methods:
             raise UsageError("no row freevs was asked for", where="--freevs-model", got=f"--methods {' '.join(config.methods)}",
                              remedy="leave it out, or add freevs to --methods")  # fmt: skip
         changes: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": freevs}}
@@ -241,15 +241,15 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         control = Row(LONGER, f"{LONGER_TITLE} ({LONGER})", BASE)
         rows = [
             control if name == LONGER else Row(name, f"{METHODS[name].title} ({name})", name, changes=changes.get(name, {}))
-            for name in asked
+            for name in methods
         ]
-    made = []
+    complete = []
     for row in rows:
         if METHODS[row.method].made_by == "render" and not row.left_out:
             fit = method_fit(usual_fit(config), row.method, preset)
             row = replace(row, fit=configuration.load(FitConfig, fit, overrides=dict(row.changes)))
-        made.append(row)
-    return tuple(made)
+        complete.append(row)
+    return tuple(complete)
 
 
 def _method_row(name: str, usual: FitConfig, preset: PresetName) -> Row:

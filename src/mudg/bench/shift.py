@@ -181,20 +181,20 @@ def against(logs: Sequence[Mapping[str, Any]], a: str, b: str, place: str, metri
     The difference of the means over logs, or their ratio; the standard error is the jackknife's over logs (for a difference:
     the spread of the differences of single logs over the root of their number). None with fewer than two logs.
     """
-    found = []
+    comparisons = []
     for metric in metrics.split():
         pairs = [tuple(entry["values"].get(m, {}).get(place, {}).get(metric, "") for m in (a, b)) for entry in logs]
         known = [None if any(isinstance(value, str) for value in pair) else tuple(map(float, pair)) for pair in pairs]
         both, of = [pair for pair in known if pair is not None], _ratio if metric in RATIOS else _difference
         per_log = [None if pair is None else of([pair]) for pair in known]
         where = "recorded path" if place == RECORDED else "off the recorded path"
-        found.append({
+        comparisons.append({
             "title": f"{a} against {b}, {where}: {COLUMNS[metric][0]}", "a": a, "b": b, "place": place, "metric": metric,
             "kind": "ratio" if metric in RATIOS else "difference", "value": of(both) if both else None,
             "standard_error": standard_error(of, both), "logs": len(both),
             "per_log": [None if value is None else round(value, 5) for value in per_log],
         })  # fmt: skip
-    return found
+    return comparisons
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -107,14 +107,14 @@ class Views:
             return (self.chain.filled(self.paths),)
         renders = self.renders and row.changes.get("condition", "full") == "full"
         if METHODS[row.method].made_by == "synthesize":
-            found = []
+            folders = []
             if any(path.origin != "recorded" for path in self.paths):
                 folder = self.out / "generated" / row.name if row.changes else self.out / self.virtual
-                found.append(self.chain.generated(replace(self.off_path, **row.changes), folder, renders=renders))
+                folders.append(self.chain.generated(replace(self.off_path, **row.changes), folder, renders=renders))
             if self.on_path and any(path.origin == "recorded" for path in self.paths):
                 on_path = replace(self.off_path, shifts_m=(0.0,), paths=(), **row.changes)
-                found.append(self.chain.generated(on_path, self.out / "generated" / f"{row.name}-{RECORDED}", renders=renders))
-            return tuple(found)
+                folders.append(self.chain.generated(on_path, self.out / "generated" / f"{row.name}-{RECORDED}", renders=renders))
+            return tuple(folders)
         virtual: tuple[Path, ...] = ()
         if row.name == EXACT:
             virtual = (self.chain.step(write_exact, self.truth, self.paths, self.out / EXACT),)
@@ -125,12 +125,12 @@ class Views:
     def scores(self, name: str, folders: Sequence[Path]) -> dict[Path, Mapping[str, Any]]:
         """What the scorer says of every folder of a row's views, by its own folder; the truth needs no networks that compare view with
         view."""
-        settings, found = replace(self.score, perceptual_views=0, lpips_weights="") if name == TRUTH else self.score, {}
+        settings, documents = replace(self.score, perceptual_views=0, lpips_weights="") if name == TRUTH else self.score, {}
         for number, folder in enumerate(folders):
             scored = self.out / "score" / (f"{name}-{number}" if number else name)
             self.chain.step(score.run, settings, self.scene, {name: folder}, scored, truth=self.truth)
-            found[scored] = store.read_json(scored / "metrics.json")
-        return found
+            documents[scored] = store.read_json(scored / "metrics.json")
+        return documents
 
     def film(self, shown: Mapping[str, Path | Sequence[Path]]) -> list[str]:
         """Make a picture (or video) of every trajectory; returns their names. With another method the old ones are out of date, whatever
@@ -141,10 +141,10 @@ class Views:
 
 def score_settings(config: BenchConfig, table: PaperTable) -> ScoreConfig:
     """How every row of a table is scored: the table's resize rule unless another was asked for; LPIPS, if computed, at all views."""
-    given = config.score
-    resize = table.resize if given.fid_resize == ScoreConfig().fid_resize else given.fid_resize
-    views = ALL_VIEWS if given.lpips_weights else PERCEPTUAL_VIEWS
-    return on_device(replace(given, baseline=False, error_pictures=False, fid_resize=resize, perceptual_views=views), config.device)
+    settings = config.score
+    resize = table.resize if settings.fid_resize == ScoreConfig().fid_resize else settings.fid_resize
+    views = ALL_VIEWS if settings.lpips_weights else PERCEPTUAL_VIEWS
+    return on_device(replace(settings, baseline=False, error_pictures=False, fid_resize=resize, perceptual_views=views), config.device)
 
 
 def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
@@ -152,7 +152,7 @@ def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
     ``.json``), that one is taken."""
     own: dict[str, Any] = {}
     for name in PER_LOG:
-        given = getattr(config, name, "")
-        entries = [path for ending in ("", ".json") if given and (path := Path(given) / f"{log}{ending}").exists()]
+        folder = getattr(config, name, "")
+        entries = [path for ending in ("", ".json") if folder and (path := Path(folder) / f"{log}{ending}").exists()]
         own |= {name: str(entries[0])} if entries else {}
     return replace(config, **own)

@@ -60,6 +60,11 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[
     return markdown(Table.of_texts(heads, rows))
 
 
+def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
+    """Values of a row by the format of each; ``-``: there is no such number."""
+    return ["-" if row[key] is None else form.format(row[key]) for key, form in forms.items()]
+
+
 def latex(table: Table) -> list[str]:
     """Lines of a LaTeX ``tabular``; reasons behind cells without a number (--) are comments above it."""
     heads = table.heads[1:]
