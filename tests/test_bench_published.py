@@ -16,9 +16,8 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.bench import run as bench
 from mudg.bench import shift
-from mudg.bench.chain import LONGER, method_fit
-from mudg.bench.paper_tables import RECORDED, TABLES
-from mudg.bench.shift import rows_of
+from mudg.bench.papers import RECORDED, TABLES
+from mudg.bench.rows import LONGER, method_fit, shift_rows
 from mudg.data.city.config import CityConfig
 from mudg.data.city.logs import LogRules
 from mudg.data.clips.ablated import ConditionSources, conditions_of
@@ -71,7 +70,7 @@ def published_set_up(weights, *flags):
     """What ``mudg bench`` makes of ``--preset paper`` with few steps, and windows that share two frames."""
     words = ["bench", "paper", "--out", "unused", "--preset", "paper", "--model", str(weights[0]), "--synthesize.steps", "3",
              "--synthesize.overlap", "2", "--iterations", "6", "--processes", "1", "--no-videos", *flags]  # fmt: skip
-    return parse(words).settings
+    return parse(words)[0].settings
 
 
 def videos(trajectories, guided=True):
@@ -144,7 +143,7 @@ REFUSED = [
 @pytest.mark.parametrize(("name", "words", "where", "remedy"), REFUSED, ids=[f"{name} {' '.join(words)}" for name, words, *_ in REFUSED])
 def test_a_setting_that_would_change_nothing_is_refused_before_anything_is_written(tmp_path, name, words, where, remedy):
     sources = ("city:development",) if name == "paper" else ()
-    args = parse(["bench", name, *sources, "--out", str(tmp_path / "out"), *words])
+    args, _ = parse(["bench", name, *sources, "--out", str(tmp_path / "out"), *words])
     with pytest.raises(UsageError) as caught:
         bench.run(name, args.settings, args.out, sources=args.sources, preset=args.preset)
     assert caught.value.where == where and remedy in (caught.value.remedy or "")
@@ -164,7 +163,7 @@ def test_a_table_whose_rows_fit_nothing_takes_no_settings_of_fits(weights, tmp_p
 
 
 def test_a_method_for_comparison_keeps_what_the_preset_sets_and_it_does_not_know():
-    fits = {row.name: row.fit for row in rows_of(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")}
+    fits = {row.name: row.fit for row in shift_rows(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")}
     assert (fits["mudg_s"].poses.learn, fits["pvg"].poses.learn) == (True, False)
     assert fits["pvg"].start == fits["mudg_s"].start and fits["pvg"].iterations == fits["mudg_s"].iterations == 30_000
     with pytest.raises(UsageError, match="knows nothing of it"):
@@ -179,7 +178,7 @@ def test_table_2_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
     model, _ = weights
     words = ("bench paper city:development --preset paper --table mudg2 --logs 1 --frames 0:6 --resolution 64x48 --processes 1 --no-videos "
              f"--synthesize.steps 3 --synthesize.overlap 2 --model {model} --out {tmp_path / 'out'}").split()  # fmt: skip
-    args = parse(words)
+    args, _ = parse(words)
     out = bench.run("paper", args.settings, args.out, sources=args.sources, preset=args.preset)
     assert sum(passes) == videos(len(TABLES["mudg2"].rows))
     document = store.read_json(out / "bench.json")

@@ -15,9 +15,10 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
-from mudg.bench import real, real_measure, real_protocols, real_tables, real_truth
-from mudg.bench.real_protocols import SPLITS
-from mudg.bench.shift import write_fill
+from mudg.bench import columns, places, real, truth
+from mudg.bench.chain import Chain, write_fill
+from mudg.bench.places import PROTOCOLS, SPLITS
+from mudg.bench.rows import real_rows
 from mudg.core import color_match, points_seen
 from mudg.core.fusion import STATIC
 from mudg.data.city import CityWorld
@@ -38,15 +39,8 @@ from mudg.stages.config import (
     SynthesizeConfig,
 )
 
-CITY = {
-    "n_frames": 6,
-    "width": 96,
-    "height": 64,
-    "cameras": ("front", "front_left"),
-    "seed": 2100000,
-    "lidar_azimuth_step_deg": 0.6,
-}
-PROTOCOLS = {protocol.name: protocol for protocol in real_protocols.PROTOCOLS}
+CITY = {"n_frames": 6, "width": 96, "height": 64, "cameras": ("front", "front_left"), "seed": 2100000, "lidar_azimuth_step_deg": 0.6}
+BY_NAME = {protocol.name: protocol for protocol in PROTOCOLS}
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +57,12 @@ def city(tmp_path_factory):
 @pytest.mark.parametrize(
     ("moments", "length", "blocks"),
     [
-        (24, 1, [4, 8, 12, 16, 20]),
-        (24, 3, [(4, 6), (10, 12), (17, 19)]),
-        (24, 5, [(5, 9), (14, 18)]),
-        (16, 5, [(6, 10)]),
-        (3, 1, [1]),
+        (24, 1, [4, 8, 12, 16, 20]), (24, 3, [(4, 6), (10, 12), (17, 19)]), (24, 5, [(5, 9), (14, 18)]), (16, 5, [(6, 10)]), (3, 1, [1]),
         (4, 3, []),
     ],
 )
 def test_blocks_are_spread_and_leave_both_ends(moments, length, blocks):
-    found = real_protocols.blocks_of(moments, length)
+    found = places.blocks_of(moments, length)
     expected = [b if isinstance(b, tuple) else (b, b) for b in blocks]
     assert all(len(block) == length for block in found) and len(found) == len(expected)
     hidden = {moment for block in found for moment in block}
@@ -84,7 +74,7 @@ def test_blocks_are_spread_and_leave_both_ends(moments, length, blocks):
 
 def test_a_block_hides_all_cameras_and_the_sweeps_of_its_moments(city):
     scene = read_scene(city)
-    held = real_protocols.held_out(scene, SPLITS["gap-3"], ())
+    held = places.held_out(scene, SPLITS["gap-3"], ())
     first, last = dict(held.facts)["blocks"][0]
     times = [frame.view.time_s for frame in scene.frames_of("front")]
     expected = {f.id for f in scene.frames if times[first] - 0.02 <= f.view.time_s <= times[last] + 0.02}
@@ -95,17 +85,17 @@ def test_a_block_hides_all_cameras_and_the_sweeps_of_its_moments(city):
 
 def test_a_log_that_is_too_short_is_left_out_with_the_reason(city):
     scene = dataclasses.replace(read_scene(city), frames=read_scene(city).frames[:8])
-    assert "too few" in real_protocols.held_out(scene, SPLITS["gap-3"], ()).reason
+    assert "too few" in places.held_out(scene, SPLITS["gap-3"], ()).reason
     one = dataclasses.replace(scene, cameras={"front": scene.cameras["front"]}, frames=scene.frames_of("front"))
-    assert "no camera besides" in real_protocols.held_out(one, SPLITS["camera"], ()).reason
+    assert "no camera besides" in places.held_out(one, SPLITS["camera"], ()).reason
 
 
 def test_a_part_holds_nothing_of_what_is_hidden(city, tmp_path):
     scene = read_scene(city)
-    held = real_protocols.held_out(scene, SPLITS["gap-3"], ())
-    places = real_protocols.places_of(scene, held)
+    held = places.held_out(scene, SPLITS["gap-3"], ())
+    hidden = held.places(scene)
     shown = {f.id for f in scene.frames} - set(held.frames)
-    part = write_part(scene, tmp_path / "part", shown, {s.id for s in scene.sweeps} - set(held.sweeps), places)
+    part = write_part(scene, tmp_path / "part", shown, {s.id for s in scene.sweeps} - set(held.sweeps), hidden)
     assert part.source.recipe is None
     assert {f.id for f in part.frames_in("test")} == set(held.frames)
     assert {f.id for f in part.frames_in("train")} == shown
@@ -160,18 +150,18 @@ ADAPT = AdaptConfig(block=1, held_out_every=2, fit_iterations=2, steps=1, shifts
 
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
-    rows = tuple(row for row in real.METHOD_ROWS if row.name in ("nearest_fill", "mudg_s"))
     config = BenchConfig(
-        model=model, iterations=6, fit=FitConfig(densify={"kind": "none"}), synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,))
-    )
-    job = real.SplitJob(out, source, split, (), rows, config, dataclasses.replace(ADAPT, model=model), False)
+        model=model, iterations=6, fit=FitConfig(densify={"kind": "none"}), synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,)),
+        methods=("nearest_fill", "mudg_s"),
+    )  # fmt: skip
+    job = real.SplitJob(out, source, split, (), real_rows(config), config, dataclasses.replace(ADAPT, model=model), False)
     whole = read_scene(source)
-    held = real_protocols.held_out(whole, split, ())
-    real.write_seen(job, whole, held)
-    fuse.run(FuseConfig(), job.scene, job.fused)
-    cameras = real._asked_cameras(job, whole, held)
-    for row in rows:
-        real.views_of(job, row, cameras)
+    held = places.held_out(whole, split, ())
+    job.write_seen(whole, held)
+    chain, cameras = job.chain(), job.cameras(whole, held)
+    chain.fuse()
+    for row in job.rows:
+        job.views(row, chain, cameras)
     kept = ("gaussians.safetensors", "nodes.safetensors", "static.safetensors")
     return {
         path.relative_to(out).as_posix(): path.read_bytes()
@@ -188,7 +178,7 @@ def untouched(city, model, tmp_path_factory):
 @pytest.mark.parametrize("split", ["gap-3", pytest.param("camera", marks=pytest.mark.slow)])
 def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(city, model, tmp_path, split, untouched):
     scene, plain, split = read_scene(city), untouched[split], SPLITS[split]
-    held = real_protocols.held_out(scene, split, ())
+    held = places.held_out(scene, split, ())
     corrupted(scene, tmp_path / "noise", set(held.frames), set(held.sweeps))
     assert any("fit/mudg_s" in name for name in plain) and any("virtual/" in name for name in plain)
     assert any("adapt/model/weights" in name for name in plain)
@@ -272,9 +262,9 @@ def test_a_color_map_is_found_under_noise_and_outliers():
 
 
 def sight(maps, *, depth=None, rgb=None, semantics=None, photo=None):
-    target = real_truth.Target("front", None, VIEW, maps, ColorMap())
+    target = truth.Target("front", None, VIEW, maps, ColorMap())
     rgb = torch.full((3, 30, 40), 0.5) if rgb is None else rgb
-    return real_measure.Sight(target, rgb, depth, semantics, photo, None)
+    return columns.Sight(target, rgb, depth, semantics, photo, None)
 
 
 def test_columns_by_hand():
@@ -285,7 +275,7 @@ def test_columns_by_hand():
     seen = sight(
         {"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}, depth=torch.full((1, 30, 40), 12.0)
     )
-    value = lambda name: real_measure.COLUMNS[name].close(real_measure.COLUMNS[name].of(seen))  # noqa: E731
+    value = lambda name: columns.COLUMNS[name].close(columns.COLUMNS[name].of(seen))  # noqa: E731
     assert value("abs_rel") == pytest.approx((0.2 + 0.4) / 2)
     assert (value("abs_rel_static"), value("abs_rel_dynamic")) == (pytest.approx(0.2), pytest.approx(0.4))
     assert (value("rmse_static"), value("rmse_dynamic")) == (pytest.approx(2.0), pytest.approx(8.0))
@@ -294,14 +284,14 @@ def test_columns_by_hand():
     photo = torch.full((3, 30, 40), 0.5)
     photo[:, :10] = 0.6
     upper = sight({}, photo=photo)
-    assert real_measure.COLUMNS["psnr_upper"].of(upper)[0] == pytest.approx(20.0, abs=1e-4)
-    assert real_measure.COLUMNS["psnr_dynamic"].of(upper) is None
+    assert columns.COLUMNS["psnr_upper"].of(upper)[0] == pytest.approx(20.0, abs=1e-4)
+    assert columns.COLUMNS["psnr_dynamic"].of(upper) is None
     classes = np.full((30, 40), 255, np.uint8)
     classes[0, :4] = ID["road"]
     made = torch.full((30, 40), ID["road"])
     made[0, 3] = ID["car"]
     labelled = sight({"classes": classes}, semantics=made)
-    assert real_measure.COLUMNS["accuracy"].close(real_measure.COLUMNS["accuracy"].of(labelled)) == 0.75
+    assert columns.COLUMNS["accuracy"].close(columns.COLUMNS["accuracy"].of(labelled)) == 0.75
 
 
 def test_a_protocol_that_pools_weighs_cameras_by_what_was_seen_of_them():
@@ -315,8 +305,8 @@ def test_a_protocol_that_pools_weighs_cameras_by_what_was_seen_of_them():
         made = torch.full((1, 30, 40), 80.0)
         made[:, 0, :seen_px] = 10 * (1 + off)
         view = dataclasses.replace(sight({"seen": seen, "depth": depth}, depth=made, photo=photo), distance=lambda pair, d=off: d)
-        sums[place] = {name: real_measure.COLUMNS[name].of(view) for name in PROTOCOLS["camera"].columns}
-    found = real_measure.values_of(PROTOCOLS["camera"], sums)
+        sums[place] = {name: columns.COLUMNS[name].of(view) for name in BY_NAME["camera"].columns}
+    found = columns.values_of(BY_NAME["camera"], sums)
     assert [found["places"][place]["psnr_seen"] for place in sums] == [
         pytest.approx(20.0, abs=1e-4),
         pytest.approx(-20 * np.log10(0.2), abs=1e-4),
@@ -327,14 +317,14 @@ def test_a_protocol_that_pools_weighs_cameras_by_what_was_seen_of_them():
     assert mean["rmse_seen"] == pytest.approx(np.sqrt((30 * 1 + 10 * 4) / 40), abs=1e-4)
     assert mean["perceptual_seen"] == pytest.approx((30 * 0.1 + 10 * 0.2) / 40, abs=1e-5)
     assert mean["delta1_seen"] == 1.0
-    averaged = real_measure.values_of(dataclasses.replace(PROTOCOLS["camera"], pooled=False), sums)["mean"]
+    averaged = columns.values_of(dataclasses.replace(BY_NAME["camera"], pooled=False), sums)["mean"]
     assert averaged["abs_rel_seen"] == pytest.approx(0.15, abs=1e-5)
 
 
 def test_comparisons_are_differences_or_ratios():
-    assert real_measure.compared_text("psnr", 20.5, 20.0) == "+0.50"
-    assert real_measure.compared_text("perceptual", 0.09, 0.1) == "x0.900"
-    assert real_measure.compared("psnr", "none", 20.0) is None
+    assert columns.COLUMNS["psnr"].compared_text(20.5, 20.0) == "+0.50"
+    assert columns.COLUMNS["perceptual"].compared_text(0.09, 0.1) == "x0.900"
+    assert columns.COLUMNS["psnr"].compared("none", 20.0) is None
 
 
 # ---- the truth, scored as if it were a method --------------------------------------------------------------------------
@@ -346,20 +336,20 @@ def exact(city, tmp_path_factory):
 
     def of(name, classes=None):
         out = tmp_path_factory.mktemp(name)
-        scene, protocol = read_scene(city), PROTOCOLS[name]
+        scene, protocol = read_scene(city), BY_NAME[name]
         split = SPLITS[protocol.split]
-        held = real_protocols.held_out(scene, split, ())
+        held = places.held_out(scene, split, ())
         job = real.SplitJob(out, city, split, (), (), BenchConfig(), ADAPT, False)
-        real.write_seen(job, scene, held)
-        cameras = real._asked_cameras(job, scene, held)
+        job.write_seen(scene, held)
+        cameras, seen = job.cameras(scene, held), job.folder / "scene"
         world = CityWorld.from_source(scene.source)
         for path in render.trajectories(scene, RenderConfig(cameras=cameras, shifts_m=split.shifts_m)):
             with ObservationWriter(out / "views" / path.name, path.name, "truth") as writer:
                 for view in path.views:
                     writer.add(world.observation(view, world.render(view)))
-        truth = real_truth.write_targets(protocol, city, job.scene, held.frames, cameras, out / "truth")
-        scored = real_measure.write_scores(protocol, city, truth, out / "views", out / "score")
-        return store.read_json(scored / "metrics.json")["mean"], real_truth.read_targets(truth)
+        targets = truth.write_targets(protocol, city, seen, held.frames, cameras, out / "truth")
+        scored = columns.write_scores(protocol, city, targets, out / "views", out / "score")
+        return store.read_json(scored / "metrics.json")["mean"], truth.read_targets(targets)
 
     return of
 
@@ -467,13 +457,14 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
         False,
     )  # fmt: skip
     scene = read_scene(city)
-    real.write_seen(job, scene, real_protocols.held_out(scene, SPLITS["all"], ()))
-    monkeypatch.setattr(real.FitChain, "first", lambda _: tmp_path / "first")
+    job.write_seen(scene, places.held_out(scene, SPLITS["all"], ()))
+    chain = job.chain()
+    monkeypatch.setattr(Chain, "first", lambda _: tmp_path / "first")
     monkeypatch.setattr(real.adapt, "run", lambda *_, **__: job.folder / "adapt" / "model")
     numbers = {"before": {"psnr": 20.0}, "after": {"psnr": 21.0}}
     for helped, sees in ((True, "adapted"), (False, "renders")):
         store.write_json(job.folder / "adapt" / "adapt.json", {"adapted": helped, **numbers})
-        use = real.diffusion_use(job, "adapted")
+        use = job.use("adapted", chain)
         assert use.sees == sees and "20.00 dB before, 21.00 dB after" in use.note
         assert use.model == (str(job.folder / "adapt" / "model") if helped else model)
 
@@ -481,17 +472,17 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
         raise InputError("the log is too short to adapt to", got="1 clip")
 
     monkeypatch.setattr(real.adapt, "run", fail)
-    use = real.diffusion_use(job, "adapted")
+    use = job.use("adapted", chain)
     assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
     plain = str(tmp_path / "plain")
     mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
-    use = real.diffusion_use(dataclasses.replace(job, config=BenchConfig(model=plain)), "adapted")
+    use = dataclasses.replace(job, config=BenchConfig(model=plain)).use("adapted", chain)
     assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
-    assert real.diffusion_use(job, "points") == real.DiffusionUse("points", model)
+    assert job.use("points", chain) == real.DiffusionUse("points", model)
 
 
 def test_rows_say_what_they_leave_out():
-    rows = {row.name: row for row in real.rows_of(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))}
+    rows = {row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))}
     assert list(rows) == [
         "street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s", "mudg_s-no-adapt",
         "mudg_s-no-renders", "a",
@@ -524,7 +515,7 @@ def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_metho
     assert 0.3 < found["accuracy"] < 1 and 0.05 < found["miou"] < 1
     log = out / "001"
     whole = read_scene(log / "scene")
-    targets = real_truth.read_targets(log / "truth" / "classes")
+    targets = truth.read_targets(log / "truth" / "classes")
     target = targets.load(0, whole)
     known = target.maps["classes"][target.maps["classes"] != 255]
     assert set(np.unique(known)) == {ID["road"], ID["building"]} and len(known) > 100
@@ -543,9 +534,8 @@ def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
         job = real.SplitJob(
             tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), BenchConfig(), ADAPT, False,
         )  # fmt: skip
-        real.write_seen(job, read_scene(tmp_path / name), real_protocols.HeldOut())
-        fuse.run(FuseConfig(), job.scene, job.fused)
-        found.append((job.fused / "static.safetensors").read_bytes())
+        job.write_seen(read_scene(tmp_path / name), places.HeldOut())
+        found.append((job.chain().fuse() / "static.safetensors").read_bytes())
     assert found[0] == found[1]
     given = fuse.run(FuseConfig(), tmp_path / "a", tmp_path / "told")  # from the whole log the cloud takes them over
     assert (given / "static.safetensors").read_bytes() != found[0]
@@ -580,17 +570,11 @@ def test_other_folders_methods_and_names_are_refused(city, tmp_path):
 
 
 def test_pooled_values_leave_out_logs_without_a_number():
-    protocol = PROTOCOLS["gap-1"]
-    values = lambda psnr: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": psnr}, "places": {}}  # noqa: E731
-    logs = [
-        {
-            "log": name,
-            "protocols": {"gap-1": {"values": {"street_gaussians": values(a), "mudg_s": values(b)}, "facts": {}}},
-        }
-        for name, a, b in (("one", 20.0, 21.0), ("two", 22.0, "none"))
-    ]
-    rows = [{"name": "street_gaussians"}, {"name": "mudg_s"}]
-    found = real_tables.document(logs, rows, [protocol], {})["protocols"]["gap-1"]
+    protocol, logs = BY_NAME["gap-1"], []
+    for name, a, b in (("one", 20.0, 21.0), ("two", 22.0, "none")):
+        values = {m: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": v}} for m, v in (("street_gaussians", a), ("mudg_s", b))}
+        logs.append({"log": name, "protocols": {"gap-1": {"values": values, "facts": {}}}})
+    found = real.document(logs, [{"name": "street_gaussians"}, {"name": "mudg_s"}], [protocol], {})["protocols"]["gap-1"]
     assert found["pooled"]["street_gaussians"]["psnr"] == 21.0 and found["pooled"]["mudg_s"]["psnr"] == 21.0
     assert found["pooled"]["mudg_s"]["ssim"] == "none" and found["against"]["mudg_s"]["ssim"] is None
 
@@ -599,7 +583,7 @@ def test_a_view_that_a_method_lacks_is_an_error(city, tmp_path):
     fused = fuse.run(FuseConfig(), city, tmp_path / "fuse")
     paths = render.trajectories(read_scene(city), RenderConfig(cameras=("front",), shifts_m=(0.0,)))
     views = write_fill(city, fused, paths, tmp_path / "views")
-    finder = real_measure._Finder(views)
+    finder = columns.ViewFinder(views)
     assert isinstance(finder.at(paths[0].views[1]), Observation)
     with pytest.raises(InputError, match="lacks a view"):
         finder.at(dataclasses.replace(paths[0].views[1], time_s=9.0))

@@ -12,9 +12,9 @@ from test_bench import SMALL
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
 from mudg.bench import run as bench
-from mudg.bench import shift as bench_shift
-from mudg.bench import shift_page, shift_tables
-from mudg.bench.chain import LONGER
+from mudg.bench import shift
+from mudg.bench.chain import write_exact
+from mudg.bench.rows import LONGER, shift_rows
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import LogRules
@@ -37,9 +37,7 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     assert (len(development), len(reported)) == (4, 8)
     assert not set(development) & set(reported)
     trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
-    scored = {
-        from_city.city_config(from_city.CityClipRules(), c).seed for of in from_city.LISTS.values() for c in of
-    }
+    scored = {from_city.city_config(from_city.CityClipRules(), c).seed for of in from_city.LISTS.values() for c in of}
     assert not (trained | scored) & set(development + reported)
 
 
@@ -63,9 +61,7 @@ def test_the_reported_list_is_what_the_rule_gives():
 def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     judged = set(city_logs.moving_instances(world))
-    still = {
-        number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0
-    }
+    still = {number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0}
     assert judged
     assert not judged & still
 
@@ -74,7 +70,7 @@ def test_moving_instances_are_those_of_the_generator():
 
 
 def test_variants_change_fields_of_the_fit():
-    rows = bench_shift.rows_of(
+    rows = shift_rows(
         BenchConfig(methods=("mudg_s",), variant=("a=virtual.probability:0.4,densify.kind:none", "b=sh_degree:1"))
     )
     a, b = rows[-2].fit, rows[-1].fit
@@ -88,11 +84,11 @@ def test_variants_change_fields_of_the_fit():
 )
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
-        bench_shift.rows_of(BenchConfig(variant=(text,)))
+        shift_rows(BenchConfig(variant=(text,)))
 
 
 def test_ablation_brings_the_rows_it_is_compared_with():
-    rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("mudg_r",), ablation=True))}
+    rows = {r.name: r.fit for r in shift_rows(BenchConfig(methods=("mudg_r",), ablation=True))}
     assert list(rows) == ["street_gaussians", "mudg_r", "mudg_s", "only_I", "only_I_D", "only_I_S", "exact"]
     full = rows["mudg_s"]
     no_depth, virtual = {"depth_weight": 0, "lidar_weight": 0}, full.virtual
@@ -106,7 +102,7 @@ def test_ablation_brings_the_rows_it_is_compared_with():
 
 
 def test_published_methods_are_rows_where_they_are_asked_for():
-    rows = {r.name: r.fit for r in bench_shift.rows_of(BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30))}
+    rows = {r.name: r.fit for r in shift_rows(BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30))}
     assert list(rows) == ["street_gaussians", "pvg", "emernerf"]
     assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
     assert not set(PUBLISHED) & set(BenchConfig().methods)
@@ -114,16 +110,16 @@ def test_published_methods_are_rows_where_they_are_asked_for():
 
 
 def test_the_control_has_the_settings_of_the_first_fit():
-    rows = bench_shift.rows_of(BenchConfig(methods=("mudg_s", LONGER, "street_gaussians"), iterations=30))
+    rows = shift_rows(BenchConfig(methods=("mudg_s", LONGER, "street_gaussians"), iterations=30))
     assert [row.name for row in rows] == ["street_gaussians", LONGER, "mudg_s"]
     assert rows[1].fit == rows[0].fit
 
 
 def test_unknown_methods_and_repeated_names_are_refused():
     with pytest.raises(UsageError, match="unknown method"):
-        bench_shift.rows_of(BenchConfig(methods=("nerf",)))
+        shift_rows(BenchConfig(methods=("nerf",)))
     with pytest.raises(UsageError, match="same name"):
-        bench_shift.rows_of(BenchConfig(variant=("mudg_s=densify.kind:none",)))
+        shift_rows(BenchConfig(variant=("mudg_s=densify.kind:none",)))
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
@@ -131,43 +127,27 @@ def test_unknown_methods_and_repeated_names_are_refused():
 
 def made_up(psnr, abs_rel):
     """Logs whose methods have the given numbers at 2 m and these plus 1 at 4 m; nothing else."""
-    logs = []
-    for number in range(len(psnr["a"])):
-        values = {
-            m: {
-                p: {"psnr": psnr[m][number] + more, "abs_rel": abs_rel[m][number]}
-                for p, more in (("0", 5), ("2", 0), ("4", 1))
-            }
-            for m in psnr
-        }
-        facts = {
-            "log": number,
-            "turn_deg": 1.0,
-            "length_m": 2.0,
-            "movers": 3,
-            "mover_share": 0.1,
-            "words": "x",
-            "films": [],
-            "seconds": {},
-        }
-        logs.append({**facts, "values": values})
-    return logs
+    facts = {"turn_deg": 1.0, "length_m": 2.0, "movers": 3, "mover_share": 0.1, "words": "x", "films": [], "seconds": {}}
+    places = (("0", 5), ("2", 0), ("4", 1))
+    values = [
+        {m: {p: {"psnr": psnr[m][log] + more, "abs_rel": abs_rel[m][log]} for p, more in places} for m in psnr}
+        for log in range(len(psnr["a"]))
+    ]  # fmt: skip
+    return [{"log": log, **facts, "values": of} for log, of in enumerate(values)]
 
 
 def test_differences_and_ratios_with_their_standard_errors_by_hand():
     logs = made_up({"a": [20.0, 22.0, 27.0], "b": [19.0, 20.0, 24.0]}, {"a": [0.1, 0.2, 0.3], "b": [0.2, 0.2, 0.2]})
     for entry in logs:
-        entry["values"] = {m: shift_tables._with_mean(of, ["2", "4"]) for m, of in entry["values"].items()}
-    difference = shift_tables.compare(
-        logs, shift_tables.Comparison("", "a", "b", "shifted", "psnr", "difference")
-    )
-    assert difference["value"] == pytest.approx(2.0)
+        entry["values"] = {m: shift.with_mean(of, ["2", "4"]) for m, of in entry["values"].items()}
+    (difference,) = shift.against(logs, "a", "b", "shifted", "psnr")
+    assert (difference["kind"], difference["value"]) == ("difference", pytest.approx(2.0))
     assert difference["standard_error"] == pytest.approx(np.std([1, 2, 3], ddof=1) / math.sqrt(3))
-    ratio = shift_tables.compare(logs, shift_tables.Comparison("", "a", "b", "2", "abs_rel", "ratio"))
-    assert ratio["value"] == pytest.approx(1.0)
+    (ratio,) = shift.against(logs, "a", "b", "2", "abs_rel")
+    assert (ratio["kind"], ratio["value"]) == ("ratio", pytest.approx(1.0))
     left = [1.25, 1.0, 0.75]  # ratio of means without the first, second, third log
     assert ratio["standard_error"] == pytest.approx(math.sqrt(2 / 3 * sum((v - 1.0) ** 2 for v in left)))
-    one = shift_tables.compare(logs[:1], shift_tables.Comparison("", "a", "b", "2", "psnr", "difference"))
+    (one,) = shift.against(logs[:1], "a", "b", "2", "psnr")
     assert (one["value"], one["standard_error"]) == (1.0, None)
 
 
@@ -175,28 +155,19 @@ def test_what_a_log_lacks_is_left_out_and_named():
     logs = made_up({"a": [20.0, 22.0], "b": [19.0, 20.0]}, {"a": [0.1, 0.2], "b": [0.2, 0.2]})
     logs[1]["values"]["a"]["2"]["psnr"] = "no truth"
     rows = [{"name": "a", "title": "a", "fit": None}, {"name": "b", "title": "b", "fit": None}]
-    settings = {
-        "list": "x",
-        "iterations": 1,
-        "seed": 0,
-        "frames": 4,
-        "size_px": [8, 8],
-        "cameras": ["front"],
-        "held_out_every": 4,
-        "renders": True,
-        "continued_share": 0.5,
-    }
-    document = shift_tables.document(logs, rows, [2.0, 4.0], settings)
+    settings = {"list": "x", "iterations": 1, "seed": 0, "frames": 4, "size_px": [8, 8], "cameras": ["front"], "held_out_every": 4,
+                "renders": True, "continued_share": 0.5}  # fmt: skip
+    document = shift.document(logs, rows, [2.0, 4.0], settings)
     assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
     assert document["logs"][1]["values"]["a"]["shifted"]["psnr"] == "no truth"
     assert document["pooled"]["a"]["0"]["psnr"]["mean"] == pytest.approx(26.0)
     assert document["pooled"]["b"]["shifted"]["psnr"]["mean"] == pytest.approx(20.0)
     assert document["pooled"]["a"]["2"]["miou"] == "not produced"
-    assert "not produced" in shift_tables.markdown(document)
+    assert "not produced" in shift.markdown(document)
     evil = "<script>alert(1)</script>"
     document["methods"][0]["name"], document["pooled"][evil] = evil, document["pooled"]["a"]
     document["logs"][0] |= {"log": evil, "words": evil, "films": [evil]}
-    page = shift_page.page(document)
+    page = shift.page(document)
     assert evil not in page and page.count("&lt;script&gt;alert(1)") >= 5
 
 
@@ -207,14 +178,14 @@ def test_what_a_log_lacks_is_left_out_and_named():
 def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("shift")
     config = BenchConfig(logs=1, iterations=30, processes=1, methods=("nearest_fill", "street_gaussians"))
-    return bench_shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
+    return shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
 
 
 def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made, tmp_path):
     truth = made[0] / str(city_logs.DEVELOPMENT[0]) / "truth"
     names = sorted(path.name for path in truth.iterdir() if path.is_dir())
     paths = [SimpleNamespace(name=name, origin="shifted" if "shift" in name else "recorded") for name in names]
-    out = bench_shift.write_exact(truth, paths, tmp_path / "exact")
+    out = write_exact(truth, paths, tmp_path / "exact")
     sets = list_observation_sets(out)
     assert sorted(sets) == [name for name in names if "shift" in name] != names
     seen, true = (read_observations(folder / "front_shift+3.0")[1] for folder in (out, truth))
@@ -236,7 +207,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert (out / log / "film" / "front_shift+3.0.jpg").is_file()
     assert f'src="{log}/film/front_shift%2B3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
-    again = bench_shift.run(
+    again = shift.run(
         dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify.kind:none",)), out,
         rules=TINY, distances_m=(3.0,),
     )  # fmt: skip
@@ -251,7 +222,7 @@ def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp
     mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
     log = out / str(city_logs.DEVELOPMENT[0])
     variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
-    bench_shift.run(
+    shift.run(
         dataclasses.replace(config, methods=("mudg_s", LONGER), videos=False, model=str(tmp_path / "model"), variant=variants), out,
         rules=TINY, distances_m=(3.0,), overwrite=True,
     )  # fmt: skip

@@ -13,12 +13,13 @@ from mudg.base.errors import UsageError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import FusedCloud, Photo
 from mudg.bench import chain
-from mudg.bench.chain import FitChain, repair_settings
+from mudg.bench.chain import Chain, repair_settings
+from mudg.bench.rows import Row
 from mudg.data.clips import condition as clips
 from mudg.data.clips.ablated import ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules
 from mudg.methods import METHODS
-from mudg.stages.config import FitConfig, SynthesizeConfig
+from mudg.stages.config import BenchConfig, FitConfig, SynthesizeConfig
 from mudg.stages.fitting.recipes import recipe_of
 from mudg.stages.learning import loading
 
@@ -76,37 +77,34 @@ def test_repaired_views_move_towards_their_places():
 def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with_the_first(tmp_path, monkeypatch):
     done: list[tuple] = []
 
-    def repaired(config, scene, fused, out, *, fitted, overwrite):
+    def repaired(config, scene, fused, out, *, fitted, overwrite=False):
         done.append(("repair", config.shifts_m, "/".join(fitted.parts[-2:])))
         for shift in config.shifts_m:
             (out / f"front_shift{shift:+.1f}").mkdir(parents=True)
             (out / f"front_shift{shift:+.1f}" / "observations.json").write_text("{}")
         return out
 
-    def fitted(config, scene, fused, out, *, observations, start, overwrite):
+    def fitted(config, scene, fused, out, *, observations, start, overwrite=False):
         begun = None if start is None else "/".join(start.parts[-2:])
         done.append((config.method, config.iterations, ["/".join(path.parts[-2:]) for path in observations], begun))
         return out
 
     monkeypatch.setattr(chain.synthesize, "run", repaired)
     monkeypatch.setattr(chain.fit, "run", fitted)
-    usual = FitConfig(method="mudg_s", iterations=100)
-    fits = FitChain(tmp_path, tmp_path / "scene", tmp_path / "fuse", usual, False, generator=SynthesizeConfig(shifts_m=(3.0,)))
-    assert fits.fitted("difix", replace(usual, method="difix"), ()) == tmp_path / "fit" / "difix"
+    steps = Chain(tmp_path, tmp_path / "scene", BenchConfig(iterations=100), False, SynthesizeConfig(shifts_m=(3.0,)))
+    row = Row("difix", "", "difix", FitConfig(method="difix", iterations=100))
+    assert steps.fitted(row) == tmp_path / "fit" / "difix"
     first = "fit/street_gaussians"
     assert [entry for entry in done if entry[0] != "street_gaussians"] == [
         ("repair", (1.0,), first), ("difix", 50, ["1/front_shift+1.0"], first),
         ("repair", (2.0,), "start/difix-1"), ("difix", 50, ["1/front_shift+1.0", "2/front_shift+2.0"], first),
         ("repair", (3.0,), "start/difix-2"), ("difix", 50, ["1/front_shift+1.0", "2/front_shift+2.0", "3/front_shift+3.0"], first),
     ]  # fmt: skip
-    many = replace(fits, out=tmp_path / "many", generator=SynthesizeConfig(shifts_m=(2.0, 3.0, 4.0)))
-    many.fitted("difix", replace(usual, method="difix"), ())
+    replace(steps, out=tmp_path / "many", generator=SynthesizeConfig(shifts_m=(2.0, 3.0, 4.0))).fitted(row)
     assert done[-1][2] == [  # steps two and three pass places of the step before: the newer views count, once
         "1/front_shift+0.7", "1/front_shift+1.0", "2/front_shift+1.3", "3/front_shift+2.0", "2/front_shift+2.7", "3/front_shift+3.0",
         "3/front_shift+4.0",
     ]  # fmt: skip
-    with pytest.raises(UsageError, match="settings of generated"):
-        replace(fits, generator=None).fitted("difix", replace(usual, method="difix"), ())
 
 
 def test_only_the_colour_of_a_repair_counts():

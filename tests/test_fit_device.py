@@ -24,10 +24,8 @@ from mudg.base import store
 from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.bench import chain
+from mudg.bench import loop, rows
 from mudg.bench import poses as bench_poses
-from mudg.bench import real as bench_real
-from mudg.bench import shift as bench_shift
 from mudg.core import native_ops
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig
@@ -421,17 +419,15 @@ def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():
 
 def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
     config = BenchConfig(device="cuda:1", methods=("street_gaussians",), variant=("wide=width_px:64",))
-    fits = [row.fit for row in bench_shift.rows_of(config)] + [
-        row.settings for row in bench_real.rows_of(config) if row.varied
-    ]
+    fits = [row.fit for row in rows.shift_rows(config)] + [row.fit for row in rows.real_rows(config) if row.varied]
     assert len(fits) == 3
     assert {
-        fitted.device for fitted in (*fits, chain.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
+        fitted.device for fitted in (*fits, rows.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
     } == {"cuda:1"}
-    monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
-    assert chain.at_once(config) == 1
-    assert chain.at_once(replace(config, processes=3)) == 3
-    assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
+    monkeypatch.setattr(loop, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
+    assert loop.at_once(config) == 1
+    assert loop.at_once(replace(config, processes=3)) == 3
+    assert loop.at_once(replace(config, device="cpu")) == os.cpu_count()
 
 
 # ---- render and score -------------------------------------------------------------------------------------------------

@@ -22,8 +22,8 @@ from toy_scene import ToyStreet
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import UsageError
+from mudg.bench import chain, page
 from mudg.bench import run as bench
-from mudg.bench import shift, shift_page
 from mudg.core import trajectory
 from mudg.data.city import CityConfig
 from mudg.data.scene import read_scene, write_zip
@@ -130,16 +130,16 @@ VERBS: dict[str, Verb] = {
         lambda g, out, v, o: score_truth.write_truth(g["city"], _paths(g["city"], v), out, overwrite=o), ("city",)
     ),
     "film": Verb(
-        lambda g, out, v, o: shift_page.film(
+        lambda g, out, v, o: page.film(
             {"truth": g["views"], **({"b": g["views"]} if v == 2 else {})}, _paths(g["scene"], 1), out, overwrite=o
         ),
         ("views",),
     ),
     "fill": Verb(
-        lambda g, out, v, o: shift.write_fill(g["scene"], g["fused"], _paths(g["scene"], v), out, overwrite=o), ("scene", "fused")
+        lambda g, out, v, o: chain.write_fill(g["scene"], g["fused"], _paths(g["scene"], v), out, overwrite=o), ("scene", "fused")
     ),
     "exact": Verb(
-        lambda g, out, v, o: shift.write_exact(g["views"], _paths(g["scene"], 1)[: 3 - v], out, overwrite=o), ("views",)
+        lambda g, out, v, o: chain.write_exact(g["views"], _paths(g["scene"], 1)[: 3 - v], out, overwrite=o), ("views",)
     ),
     "bench": Verb(_bench, ("model",)),
 }  # fmt: skip

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,9 +33,10 @@ from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Observation, Scene, Track, View
-from mudg.bench import edit_runs_page as pages
+from mudg.bench import page as pages
 from mudg.bench.edit import drawn_pixels
-from mudg.bench.edit_runs_measure import RunCase, measured
+from mudg.bench.edit_runs_measure import RunCase, Shown, measured
+from mudg.bench.loop import finished
 from mudg.core import box_scores, pictures
 from mudg.core.raster.place import drawing_device
 from mudg.data.cloudfile import read_fused
@@ -42,6 +44,7 @@ from mudg.data.edits import EditScript, parse_edits
 from mudg.data.exporters.video import jpeg_bytes
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
+from mudg.report.tables import Table, cells, markdown_table
 from mudg.stages.config import BenchConfig
 from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.assets import asset_from, read_asset, write_asset
@@ -72,6 +75,17 @@ LOOKS: Final = 6
 """Frames in which the pixels of vehicles are counted, and how many vehicles, those with the largest boxes."""
 PICTURES: Final = (1 / 3, 2 / 3)
 """Where in the video the frames of the page lie."""
+HEADS: Final = (
+    "run", "edit", "warp error (lower)", "unedited", "outside changed (lower)", "structure (higher)", "LiDAR AbsRel (lower)", "unedited",
+    "uncovered AbsRel (lower)", "uncovered PSNR dB (higher)", "overlap (higher)", "unedited", "collisions", "warnings",
+)  # fmt: skip
+FORMS: Final = {
+    "warp": "{:.4f}", "warp_before": "{:.4f}", "outside": "{:.2%}", "structure": "{:.3f}", "lidar": "{:.4f}", "lidar_before": "{:.4f}",
+    "uncovered": "{:.3f}", "uncovered_psnr": "{:.2f}",
+    "overlap": "{:.2f}", "overlap_before": "{:.2f}", "collisions": "{}", "warnings": "{}",
+}  # fmt: skip
+KINDS: Final = ("unedited", "edited", "difference")
+"""Pictures of a frame."""
 OUTPUT: Final = VerbOutput("bench edit of runs", 1, ("bench.json", "bench.md", "page.html", "rows/*.json", "pictures/*.jpg", "assets/*"))
 
 
@@ -102,8 +116,8 @@ def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: b
         folder.pause()
         raise
     store.write_json(folder.path / "bench.json", document)
-    store.write_text(folder.path / "bench.md", pages.markdown(document))
-    store.write_text(folder.path / "page.html", pages.page(document, folder.path))
+    store.write_text(folder.path / "bench.md", markdown(document))
+    store.write_text(folder.path / "page.html", page(document, folder.path))
     folder.finish({"measurement": "edit", "runs": len(runs)})
     return folder.path
 
@@ -129,38 +143,41 @@ def _inputs(parts: RunParts) -> dict[str, Path]:
 
 
 def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> dict[str, Any]:
-    """All runs, one after the other."""
-    names, rows = list(runs), []
-    leads = {name: _lead(name, parts, device, out) for name, parts in runs.items()}
+    """All runs, one after the other; each is read once, if anything of it is left to measure."""
+    names, rows, cases = list(runs), [], {}
+
+    def case(name: str, lead: str = "") -> RunCase:
+        if name not in cases:
+            cases.clear()  # one at a time in memory
+            cases[name] = case_of(name, runs[name], device, lead)
+        return cases[name]
+
+    def lead_found(name: str) -> dict[str, str]:
+        lead = case(name).lead
+        write_asset(out / "assets" / f"{name}.safetensors", asset_from(runs[name], lead))
+        return {"lead": lead}
+
+    leads = {name: str(finished(out / "rows" / f"{name}_lead.json", partial(lead_found, name))["lead"]) for name in names}
     with log.task("editing runs", len(names) * len(EDITS)) as bar:
         for number, name in enumerate(names):
             giver = names[(number + 1) % len(names)]
-            left = [edit for edit in EDITS if not _row(out, name, edit).is_file()]
-            case = case_of(name, runs[name], device, leads[name]) if left else None
             for edit in EDITS:
                 bar.update(f"{name}: {edit}")
-                if case is not None and edit in left:
-                    script = script_of(case, edit, out / "assets" / f"{giver}.safetensors")
-                    values = measured(case, script, _pictures(len(case.frames), out, f"{name}_{edit.replace(' ', '_')}"))
-                    row = {"run": name, "edit": edit, "object": case.lead, "given_by": giver if edit == "insert" else None, **values}
-                    store.write_json(_row(out, name, edit), {**row, "script": script.text()})
-                rows.append(store.read_json(_row(out, name, edit)))
+
+                def row(name: str = name, edit: str = edit, giver: str = giver) -> dict[str, Any]:
+                    drive = case(name, leads[name])
+                    script = script_of(drive, edit, out / "assets" / f"{giver}.safetensors")
+                    values = measured(drive, script, _pictures(len(drive.frames), out, _stem(name, edit)))
+                    given_by = giver if edit == "insert" else None
+                    return {"run": name, "edit": edit, "object": drive.lead, "given_by": given_by, **values, "script": script.text()}
+
+                rows.append(finished(out / "rows" / f"{_stem(name, edit)}.json", row))
                 bar.advance()
     return {"schema": 1, "runs": names, "leads": leads, "rows": rows}
 
 
-def _row(out: Path, name: str, edit: str) -> Path:
-    return out / "rows" / f"{name}_{edit.replace(' ', '_')}.json"
-
-
-def _lead(name: str, parts: RunParts, device: torch.device, out: Path) -> str:
-    """Id of the vehicle of a run that is edited; the vehicle as an asset is written."""
-    place = out / "rows" / f"{name}_lead.json"
-    if not place.is_file():
-        lead = case_of(name, parts, device).lead
-        write_asset(out / "assets" / f"{name}.safetensors", asset_from(parts, lead))
-        store.write_json(place, {"lead": lead})
-    return str(store.read_json(place)["lead"])
+def _stem(name: str, edit: str) -> str:
+    return f"{name}_{edit.replace(' ', '_')}"
 
 
 def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") -> RunCase:
@@ -230,15 +247,47 @@ def script_of(case: RunCase, edit: str, asset: Path) -> EditScript:
     return next((script for script in made if not collisions(plan_edits(script, world, sources))), made[0])
 
 
-def _pictures(frames: int, out: Path, name: str) -> Any:
+def _pictures(frames: int, out: Path, name: str) -> Shown:
     """What writes the pictures of some frames."""
     chosen = {min(frames - 1, int(share * frames)): n for n, share in enumerate(PICTURES)}
 
     def shown(number: int, old: Observation, new: Observation) -> None:
         if number in chosen:
-            usual, edited = (pictures.to_bytes(seen.rgb) for seen in (old, new))
-            made = {"unedited": usual, "edited": edited, "difference": pictures.error_image(new.rgb, old.rgb)}
-            for kind, picture in made.items():
-                store.atomic_write(out / "pictures" / f"{name}_{chosen[number]}_{kind}.jpg", jpeg_bytes(picture, quality=85))
+            images = (pictures.to_bytes(old.rgb), pictures.to_bytes(new.rgb), pictures.error_image(new.rgb, old.rgb))
+            for kind, image in zip(KINDS, images, strict=True):
+                store.atomic_write(out / "pictures" / f"{name}_{chosen[number]}_{kind}.jpg", jpeg_bytes(image, quality=85))
 
     return shown
+
+
+# ---- text ----
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    """A row of the table as text; `-`: there is no such number."""
+    return [row["run"], row["edit"], *cells(row, FORMS)]
+
+
+def markdown(doc: Mapping[str, Any]) -> str:
+    """The table as text."""
+    title = f"# Edits of {len(doc['runs'])} recorded drives against their unedited fits"
+    return "\n".join([title, "", *markdown_table(HEADS, map(_cells, doc["rows"]))]) + "\n"
+
+
+def page(doc: Mapping[str, Any], out: Path) -> str:
+    """The whole page, from what ``bench.json`` holds and the pictures in ``out``, which it holds: it is for their owner."""
+    walls = []
+    for row in doc["rows"]:
+        stem = out / "pictures" / _stem(row["run"], row["edit"])
+        for number in range(len(list(stem.parent.glob(f"{stem.name}_[0-9]_edited.jpg")))):
+            images = {kind: stem.with_name(f"{stem.name}_{number}_{kind}.jpg") for kind in KINDS}
+            walls.append(pages.wall(f"{row['run']}: {row['edit']}", images, row["notes"] if number == 0 else ()))
+    return pages.render(
+        "Edited drives", "mudg bench edit",
+        "Recorded drives, edited, against their unedited fits. The pictures show your recordings: share this page with care.",
+        [
+            {"title": "Numbers", "tables": [Table.of_texts(HEADS, map(_cells, doc["rows"]))]},
+            {"title": "Pictures", "walls": walls,
+             "notes": ["Difference: mean of the channels, black = equal, through red to white = 0.35 or more."]},
+        ],
+    )  # fmt: skip

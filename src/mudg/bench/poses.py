@@ -20,6 +20,7 @@ picture consulted) takes out most. Drift is the case in which only the pictures 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mudg.base import geometry, log, seeds, store
+from mudg.base import geometry, log, seeds
 from mudg.base.config import result_settings
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene, Track
+from mudg.bench.loop import finished
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.raster.place import drawing_device
@@ -38,6 +40,7 @@ from mudg.data.city import CityConfig, write_city
 from mudg.data.scene import read_image, read_label, read_scene
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
+from mudg.report.tables import markdown_table
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
 from mudg.stages.config.fit import DensifyConfig, PoseConfig, RecordedLossConfig, StartConfig
@@ -67,32 +70,30 @@ class Errors:
 
 
 def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    """Fit every city with boxes as they are, with noise and with offsets, poses fixed and learnt; numbers and a table."""
-    cities = LISTS[config.cities][: config.count]
-    rows = []
+    """Fit every city with boxes as they are, with noise and with offsets, poses fixed and learnt; numbers and a table. Rows that an
+    interrupted run wrote are taken as they are."""
+    cities, rows = LISTS[config.cities][: config.count], []
     with log.task("fitting", len(cities) * len(CASES)) as bar:
         for city in cities:
             scene = city_scene(city, out / "cities" / str(city))
-            for kind in dict.fromkeys(kind for kind, _ in CASES):
-                rows += _rows_of_case(config, scene, city, kind, out)
-                bar.advance(sum(case == kind for case, _ in CASES))
+            for kind, poses in CASES:
+                path = out / "rows" / f"{city}_{kind}_{poses}.json"
+                rows.append(finished(path, partial(_measured, config, scene, city, kind, poses, out / "fits" / path.stem)))
+                bar.advance()
     result = {"cities": list(cities), "iterations": config.pose_iterations, "rows": rows, "summary": summary(rows)}
     return result, table(result)
 
 
-def _rows_of_case(config: BenchConfig, scene: Scene, city: int, kind: str, out: Path) -> list[dict[str, Any]]:
-    """Fits of one city with one kind of boxes; rows that an interrupted run wrote are taken as they are."""
-    places = {poses: out / "rows" / f"{city}_{kind}_{poses}.json" for case, poses in CASES if case == kind}
-    if not all(place.is_file() for place in places.values()):
-        given = scene if kind == "none" else replace(scene, tracks=disturbed(scene.tracks, kind, config.seed + city))
-        cloud = fuse_sweeps(scene_sweeps(given, FuseConfig()), given.tracks, rules_of(FuseConfig()))[0]
-        for poses, place in places.items():
-            if not place.is_file():
-                state = fitted(given, cloud, fit_settings(config, poses), out / "fits" / place.stem)
-                store.write_json(
-                    place, {"city": city, "boxes": kind, "poses": poses, **row_of(scene, given, state.model)}
-                )
-    return [store.read_json(place) for place in places.values()]
+def _measured(config: BenchConfig, scene: Scene, city: int, kind: str, poses: str, out: Path) -> dict[str, Any]:
+    """A row: errors of a fit of one city with one kind of boxes."""
+    given = replace(scene, tracks=disturbed(scene.tracks, kind, config.seed + city))
+    model = fitted(given, cloud_of(given), fit_settings(config, poses), out).model
+    return {"city": city, "boxes": kind, "poses": poses, **row_of(scene, given, model)}
+
+
+def cloud_of(scene: Scene) -> FusedCloud:
+    """The clouds of a scene, as fuse makes them by default."""
+    return fuse_sweeps(scene_sweeps(scene, FuseConfig()), scene.tracks, rules_of(FuseConfig()))[0]
 
 
 def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
@@ -205,19 +206,10 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         mine = [row for row in rows if (row["boxes"], row["poses"]) == (kind, poses)]
         objects = [found for row in mine for found in row["objects"]]
         keys = np.array([found["keys"] for found in objects], float)
-        pooled = {
-            name: float(np.sqrt((np.array([found[name] for found in objects]) ** 2 * keys).sum() / keys.sum()))
-            for name in (
-                f"{when}{how}_{unit}"
-                for when in ("before", "after")
-                for how in ("", "_absolute")
-                for unit in ("m", "rad")
-            )
-        }
-        shares = {
-            f"recovered_{unit}": 1 - pooled[f"after_{unit}"] / max(pooled[f"before_{unit}"], 1e-9)
-            for unit in ("m", "rad")
-        }
+        pooled = {}
+        for name in (f"{when}{how}_{unit}" for when in ("before", "after") for how in ("", "_absolute") for unit in ("m", "rad")):
+            pooled[name] = float(np.sqrt((np.array([found[name] for found in objects]) ** 2 * keys).sum() / keys.sum()))
+        shares = {f"recovered_{unit}": 1 - pooled[f"after_{unit}"] / max(pooled[f"before_{unit}"], 1e-9) for unit in ("m", "rad")}
         psnr = float(np.nanmean([row["psnr_moving"] for row in mine]))
         made.append({"boxes": kind, "poses": poses, "objects": len(objects), "keys": int(keys.sum()), **pooled, **shares,
                      "psnr_moving": psnr})  # fmt: skip
@@ -226,19 +218,20 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def table(result: dict[str, Any]) -> str:
     """The summary as text."""
-    lines = [
-        f"# Boxes of {len(result['cities'])} generated logs ({FRAMES} frames, {WIDTH}x{HEIGHT}, {result['iterations']} steps)", "",
-        f"noise: {NOISE_M} m along each axis and 1 degree, anew per key; drift: the same, correlated over {DRIFT_S} s; offset: once per",
-        "object. A constant motion per object is taken out of all errors but the absolute one.", "",
-        "| boxes | poses | objects | position [m] | after | recovered | yaw [deg] | after | recovered | absolute [m] | PSNR moving [dB] |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    heads = ["boxes", "poses", "objects", "position [m]", "after", "recovered", "yaw [deg]", "after", "recovered", "absolute [m]",
+             "PSNR moving [dB]"]  # fmt: skip
+    cells = []
     for row in result["summary"]:
         recoverable = row["boxes"] in ("noise", "drift") and row["poses"] != "fixed"
         shares = [f"{row[f'recovered_{unit}']:.0%}" if recoverable else "-" for unit in ("m", "rad")]
-        degrees = [np.degrees(row[f"{when}_rad"]) for when in ("before", "after")]
-        lines.append(
-            f"| {row['boxes']} | {row['poses']} | {row['objects']} | {row['before_m']:.3f} | {row['after_m']:.3f} | {shares[0]} "
-            f"| {degrees[0]:.2f} | {degrees[1]:.2f} | {shares[1]} | {row['after_absolute_m']:.3f} | {row['psnr_moving']:.2f} |"
-        )
-    return "\n".join(lines) + "\n"
+        degrees = [f"{np.degrees(row[f'{when}_rad']):.2f}" for when in ("before", "after")]
+        cells.append([
+            row["boxes"], row["poses"], str(row["objects"]), f"{row['before_m']:.3f}", f"{row['after_m']:.3f}", shares[0], *degrees,
+            shares[1], f"{row['after_absolute_m']:.3f}", f"{row['psnr_moving']:.2f}",
+        ])  # fmt: skip
+    return "\n".join([
+        f"# Boxes of {len(result['cities'])} generated logs ({FRAMES} frames, {WIDTH}x{HEIGHT}, {result['iterations']} steps)", "",
+        f"noise: {NOISE_M} m along each axis and 1 degree, anew per key; drift: the same, correlated over {DRIFT_S} s; offset: once per",
+        "object. A constant motion per object is taken out of all errors but the absolute one.", "",
+        *markdown_table(heads, cells),
+    ]) + "\n"  # fmt: skip

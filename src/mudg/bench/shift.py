@@ -1,114 +1,86 @@
 """``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
 
-Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the ordinary
-verbs, so that whatever is finished is reused and another variant costs only itself. Fits under virtual views go on with the one on
-recorded views, as in ``mudg run`` (``bench/chain.py``). Results do not depend on how many logs are worked on at a time: each has
-one thread.
+Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the ordinary verbs, so that
+whatever is finished is reused and another variant costs only itself. Fits under virtual views go on with the one on recorded views, as in
+``mudg run``.
 
-    OUT/<log>/scene  fuse  synthesize  truth  nearest_fill  fit/<method>  start/<method>  render/<method>  score/<method>  film
+    OUT/<log>/...   see ``bench/views.py``; generated views lie in OUT/<log>/synthesize
     OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import config as configuration
-from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
-from mudg.base.plain_yaml import parse_yaml
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
-from mudg.base.types import Trajectory
-from mudg.bench import shift_page, shift_tables
-from mudg.bench.chain import (
-    LONGER,
-    LONGER_TITLE,
-    VIRTUAL_TERMS,
-    FitChain,
-    at_once,
-    chain_settings,
-    each_log,
-    generator_of,
-    learns_virtual,
-    made,
-    method_fit,
-    refuse_foreign,
-    refuse_unfit,
-    seconds_of,
-    usual_fit,
-)
+from mudg.base.run_folder import refuse_overlap
+from mudg.bench import page as pages
+from mudg.bench.loop import compare, refuse_foreign, seconds_of
+from mudg.bench.papers import RECORDED, PaperTable, Place
+from mudg.bench.places import listed_cities
+from mudg.bench.rows import BASE, DIFFUSION, EXACT, FILL, FULL, chain_settings, generator_of, refuse_unfit, shift_rows
+from mudg.bench.views import Views, score_settings
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
-from mudg.data.cloudfile import read_fused
-from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
-from mudg.data.scene import read_scene
-from mudg.methods import PUBLISHED
 from mudg.models.mdm import files as mdm_files
-from mudg.report.score_tables import title_of
-from mudg.stages import fuse, ingest, render, score, score_truth, synthesize
-from mudg.stages.config import (
-    BenchConfig,
-    FitConfig,
-    IngestConfig,
-    PresetName,
-    RenderConfig,
-    ScoreConfig,
-    SynthesizeConfig,
+from mudg.report.tables import Table, markdown_table
+from mudg.stages.config import BenchConfig, PresetName
+
+SHIFTED: Final = "shifted"
+"""The mean over the lateral distances."""
+COLUMNS: Final[dict[str, tuple[str, int]]] = {
+    "psnr": ("PSNR dB", 2), "ssim": ("SSIM", 3), "perceptual": ("perceptual", 4), "abs_rel": ("AbsRel", 4), "rmse_m": ("RMSE m", 2),
+    "delta1": ("delta1", 4), "miou": ("mIoU", 3), "flicker": ("flicker", 3), "psnr_movers": ("PSNR of dynamic objects", 2),
+}  # fmt: skip
+"""Metric -> heading, digits."""
+RATIOS: Final = ("perceptual", "abs_rel", "rmse_m", "flicker")
+"""Metrics whose comparison is a ratio (a / b); of the others it is a difference (a - b)."""
+COMPARISONS: Final = (
+    (FULL, BASE, SHIFTED, "psnr ssim perceptual abs_rel rmse_m delta1 miou flicker psnr_movers"),
+    (FULL, DIFFUSION, SHIFTED, "psnr perceptual abs_rel miou flicker"),
+    (FULL, BASE, RECORDED, "psnr ssim perceptual abs_rel miou"),
+    (BASE, "gs3d", RECORDED, "psnr psnr_movers"),
+    (BASE, "gs3d", SHIFTED, "psnr psnr_movers"),
+    (FULL, FILL, SHIFTED, "psnr perceptual abs_rel miou"),
+    (DIFFUSION, FILL, SHIFTED, "psnr perceptual abs_rel miou"),
 )
-
-TEST_EVERY: Final = 4
-PERCEPTUAL_VIEWS: Final = 12
-WITHOUT, WITH, DIFFUSION, FILL = "street_gaussians", "mudg_s", "mudg_r", score.BASELINE
-GENERATED: Final = (FILL, DIFFUSION)
-"""Methods without a fit."""
-ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
-    **{name: (description, weights) for name, (_, description, weights) in VIRTUAL_TERMS.items()},
-    "exact": ("the truth in place of generated views", {}),
-}
-"""Rows beside street_gaussians (no virtual views) and mudg_s (all terms): three as in table 3 of the paper, and the most that
-virtual views can bring at this number of steps."""
-EXACT: Final = "exact"
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+"""A method, that against which it is held, a place, and metrics."""
+ABLATION_ROWS: Final = {
+    BASE: "none", "only_I": "+ I", "only_I_D": "+ I + D", "only_I_S": "+ I + S", FULL: "+ I + D + S", EXACT: "exact views",
+}  # fmt: skip
+SHOWN: Final = (FILL, "gs3d", BASE, DIFFUSION, FULL)
+"""Methods in the videos."""
 _PAGES: Final = ("bench.json", "bench.md", "page.html")
-_FILL_OUTPUT: Final = VerbOutput(FILL, 1, below("*", OBSERVATION_FILES))
-_EXACT_OUTPUT: Final = VerbOutput(EXACT, 1, below("*", OBSERVATION_FILES))
 
 
 @dataclass(frozen=True)
-class Row:
-    """A method to compare: its name in tables and folders, its title, and the settings of its fit (None = no fit; those of the first fit
-    where it is ``LONGER``)."""
-
-    name: str
-    title: str
-    fit: FitConfig | None
-
-
-@dataclass(frozen=True)
-class LogJob:
-    """One log of the list, in terms that another process understands; ``renders``: whether the diffusion model uses those of a fit."""
-
-    seed: int
-    out: Path
-    rules: LogRules
-    shifts_m: tuple[float, ...]
-    rows: tuple[Row, ...]
-    config: BenchConfig
-    synthesize: SynthesizeConfig
-    renders: bool
-    overwrite: bool
+class _Log(Views):
+    """One log of the list."""
 
     @property
-    def fits(self) -> FitChain:
-        """The fits."""
-        config, out = self.config, self.out
-        return FitChain(
-            out, out / "scene", out / "fuse", usual_fit(config), self.overwrite, config.continue_fit, self.synthesize
-        )
+    def title(self) -> str:
+        """For the progress bar."""
+        return self.log.name
+
+    def measure(self) -> dict[str, Any]:
+        """Facts of the log, scores of each method by distance, and seconds of each step."""
+        views, values = self.of_rows(), {}
+        for name, folders in views.items():
+            (metrics,) = self.scores(name, folders).values()
+            values[name] = {f"{entry['distance_m']:g}": entry["values"] for entry in metrics["by_distance"]}
+        films = []
+        if self.config.videos:
+            films = self.film({"truth": self.truth, **{name: of[0] for name, of in views.items() if name in SHOWN}})
+        facts = city_logs.facts(self.log.seed, self.log.rules)
+        return {
+            "log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
+            "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": values,
+            "seconds": seconds_of(self.out),
+        }  # fmt: skip
 
 
 def run(
@@ -127,195 +99,256 @@ def run(
         UsageError: an unknown method, a malformed variant, a setting that no row uses, or ``out`` holds logs of other settings. Whatever
             a verb raises.
     """
-    rows = rows_of(config, preset)
+    rows, out = shift_rows(config, preset), Path(out)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
-    refuse_foreign(Path(out), _PAGES, _is_own, lambda entry: entry.name.isdigit())
-    seeds = city_logs.LISTS[config.list][: config.logs]
-    shifts = tuple(sign * d for d in distances_m for sign in (1.0, -1.0))
-    painted = replace(generator_of(config), cameras=("front",), shifts_m=shifts)
-    renders = mdm_files.uses_renders(config.model)
-    generates = any(row.name == DIFFUSION for row in rows)
-    fits = [row.fit for row in rows if row.fit is not None]
-    refuse_unfit(config, preset, fits=fits, generators=[painted] * generates, renders=renders)
-    jobs = [
-        LogJob(seed, Path(out) / str(seed), rules, (0.0, *shifts), rows, config, painted, renders, overwrite) for seed in seeds
-    ]
-    logs = each_log(make_log, jobs, [str(seed) for seed in seeds], at_once(config))
-    document = shift_tables.document(
-        logs, rows_as_values(rows), list(distances_m), {**settings_of(config, rules), **chain_settings(config, preset)}
+    refuse_foreign(
+        out, _PAGES, lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc, lambda entry: entry.name.isdigit()
     )
-    store.write_json(Path(out) / "bench.json", document)
-    store.write_text(Path(out) / "bench.md", shift_tables.markdown(document))
-    store.write_text(Path(out) / "page.html", shift_page.page(document))
-    return Path(out)
-
-
-def _is_own(document: Mapping[str, Any]) -> bool:
-    return document["schema"] == 1 and "bench" not in document and "methods" in document
-
-
-# ---- what is compared ----
-
-
-def rows_of(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods, ablation rows and variants of a configuration, in the order of the tables.
-
-    Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant.
-    """
-    known = (FILL, "gs3d", WITHOUT, LONGER, *PUBLISHED, DIFFUSION, WITH)
-    wanted = set(config.methods) | ({WITHOUT, WITH} if config.ablation else set())
-    if not wanted or wanted - set(known):
-        raise UsageError("unknown method", where="--methods", expected=", ".join(known),
-            got=", ".join(sorted(wanted - set(known))))  # fmt: skip
-    plain = usual_fit(config)
-    titles, methods = {LONGER: LONGER_TITLE}, {LONGER: WITHOUT}
-    rows = [
-        Row(
-            name, titles.get(name, title_of(name)),
-            None if name in GENERATED else method_fit(plain, methods.get(name, name), preset),
-        )
-        for name in known
-        if name in wanted
-    ]  # fmt: skip
-    if config.ablation:
-        for name, (description, weights) in ABLATION.items():
-            rows.append(Row(name, f"with {description}", configuration.load(FitConfig, plain, overrides={"virtual": weights})))
-    for text in config.variant:
-        rows.append(variant_of(text, plain))
-    names = [row.name for row in rows]
-    if len(set(names)) < len(names):
-        raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
-    return tuple(rows)
-
-
-def variant_of(text: str, plain: FitConfig) -> Row:
-    """A row from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field. UsageError if malformed or
-    no field of ``FitConfig``."""
-    name, separator, rest = text.partition("=")
-    fields: dict[str, Any] = {}
-    for part in rest.split(","):
-        field, colon, value = part.partition(":")
-        if not (separator and colon and field and _NAME.fullmatch(name)):
-            raise UsageError("malformed variant", where="--variant", expected="NAME=FIELD:VALUE,FIELD:VALUE", got=text)
-        try:
-            fields[field.strip()] = parse_yaml(value, field)
-        except InputError as error:
-            raise UsageError("malformed value", where=f"--variant {name}: {field}", got=value) from error
-    changed = configuration.load(FitConfig, plain, overrides=configuration.nested(fields))
-    return Row(name, f"{name}: {rest}", changed)
-
-
-def rows_as_values(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The rows for JSON."""
-    return [
+    places = [Place(name=RECORDED, title="", shifts_m=[0.0]), *(Place(name=f"{d:g}", title="", shifts_m=[d, -d]) for d in distances_m)]
+    table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
+    jobs = [
+        _Log(log, out / log.name, table, rows, config, score_settings(config, table), renders, overwrite, "synthesize", on_path=False)
+        for log in listed_cities(config.list, config.logs, rules)
+    ]
+    refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
+    settings = {
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
+        "renders": renders, "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
+        "held_out_every": table.held_out_every, "ablation": config.ablation, **chain_settings(config, preset),
+    }  # fmt: skip
+    values = [
         {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.result_settings(r.fit)} for r in rows
     ]
+    filled = lambda logs: document(logs, values, list(distances_m), settings)  # noqa: E731
+    return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": page})
 
 
-def settings_of(config: BenchConfig, rules: LogRules) -> dict[str, Any]:
-    """What was asked for, for JSON."""
+# ---- numbers ----
+
+
+def document(
+    logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], distances_m: Sequence[float], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Everything ``bench.json`` holds.
+
+    Args:
+        logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
+        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the bench.
+    """
+    shifted = [f"{d:g}" for d in sorted(distances_m)]
+    full = [{**entry, "values": {m: with_mean(of, shifted) for m, of in entry["values"].items()}} for entry in logs]
+    names = [row["name"] for row in rows]
+    pooled = {
+        name: {p: {m: _pooled([entry["values"][name].get(p, {}).get(m, "not produced") for entry in full]) for m in COLUMNS}
+               for p in (RECORDED, *shifted, SHIFTED)}
+        for name in names
+    }  # fmt: skip
+    against_full = [r["name"] for r in rows if FULL in names and r["fit"] is not None and r["name"] not in ("gs3d", BASE, FULL)]
     return {
-        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
-        "renders": mdm_files.uses_renders(config.model),
-        "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
-        "held_out_every": TEST_EVERY, "ablation": config.ablation,
+        "schema": 1, "settings": dict(settings), "distances_m": list(distances_m), "methods": [dict(r) for r in rows],
+        "metrics": list(COLUMNS), "logs": full, "pooled": pooled,
+        "comparisons": [c for a, b, place, metrics in COMPARISONS if {a, b} <= {*names} for c in against(full, a, b, place, metrics)],
+        "variants": [
+            {"name": name, "against_mudg_s": [
+                c for place in (SHIFTED, RECORDED) for c in against(full, name, FULL, place, "psnr perceptual abs_rel miou")
+            ]}
+            for name in against_full
+        ],
     }  # fmt: skip
 
 
-# ---- the logs ----
+def with_mean(of: Mapping[str, Mapping[str, Any]], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The values of one method and log by distance, with the mean over the distances off the recorded path."""
+    mean: dict[str, Any] = {}
+    for metric in COLUMNS:
+        values = [of.get(place, {}).get(metric, "not produced") for place in shifted]
+        reasons = [value for value in values if isinstance(value, str)]
+        mean[metric] = reasons[0] if reasons else sum(values) / len(values) if values else "not produced"
+    return {**{place: dict(values) for place, values in of.items()}, SHIFTED: mean}
 
 
-def make_log(job: LogJob) -> dict[str, Any]:
-    """Everything of one log; returns its facts, the scores of each method by distance, and the seconds of each step."""
-    out = job.out
-    city = city_logs.log_config(job.seed, job.rules)
-    scene = out / "scene"
-    made(lambda o: ingest.run(IngestConfig(test_every=TEST_EVERY, city=city), ingest.CITY, scene, overwrite=o), job.overwrite)
-    fused, painted = out / "fuse", out / "synthesize"
-    made(lambda o: fuse.run(job.config.fuse, scene, fused, overwrite=o), job.overwrite)
-    if any(row.name == DIFFUSION or (row.fit is not None and learns_virtual(row.fit)) for row in job.rows):
-        first = job.fits.first() if job.renders else None
-        made(lambda o: synthesize.run(job.synthesize, scene, fused, painted, fitted=first, overwrite=o), job.overwrite)
-    drawn = RenderConfig(cameras=("front",), shifts_m=job.shifts_m, video=False, device=job.config.device)
-    paths = render.trajectories(read_scene(scene), drawn)
-    truth = out / "truth"
-    made(lambda o: score_truth.write_truth(scene, paths, truth, overwrite=o), job.overwrite)
-    found: dict[str, Any] = {}
-    views: dict[str, Path] = {}
-    for row in job.rows:
-        views[row.name] = _views_of(job, row, drawn, paths)
-        found[row.name] = _scores_of(job, row, views[row.name])
-    films: list[str] = []
-    if job.config.videos:
-        shown = {"truth": truth, **{row.name: views[row.name] for row in job.rows if row.name in shift_page.SHOWN}}
-        # With another method the old films are out of date, whatever was asked.
-        made(lambda o: shift_page.film(shown, paths, out / "film", overwrite=o), overwrite=True)
-        films = [path.name for path in paths]
-    facts = city_logs.facts(job.seed, job.rules)
-    return {
-        "log": job.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
-        "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": found,
-        "seconds": seconds_of(out),
-    }  # fmt: skip
+def _pooled(values: Sequence[Any]) -> Any:
+    """The mean over the logs that have a number, or the reason of the first log."""
+    numbers = [float(value) for value in values if not isinstance(value, str)]
+    if not numbers:
+        return str(values[0])
+    return {"mean": _mean(numbers), "standard_error": standard_error(_mean, numbers), "logs": len(numbers)}
 
 
-def _views_of(job: LogJob, row: Row, drawn: RenderConfig, paths: Sequence[Trajectory]) -> Path:
-    """The folder with a method's views, made if need be."""
-    scene, fused, painted = job.out / "scene", job.out / "fuse", job.out / "synthesize"
-    if row.name == DIFFUSION:
-        return painted
-    if row.name == FILL:
-        return made(lambda o: write_fill(scene, fused, paths, job.out / FILL, overwrite=o), job.overwrite)
-    settings = row.fit
-    if settings is None:
-        raise UsageError("a method without views", got=row.name)
-    if row.name == EXACT:
-        painted = made(lambda o: write_exact(job.out / "truth", paths, job.out / EXACT, overwrite=o), job.overwrite)
-    model, views = job.fits.fitted(row.name, settings, (painted,)), job.out / "render" / row.name
-    return made(lambda o: render.run(drawn, scene, model, views, overwrite=o), job.overwrite)
+def against(logs: Sequence[Mapping[str, Any]], a: str, b: str, place: str, metrics: str) -> list[dict[str, Any]]:
+    """Comparisons of two methods over the logs that have both numbers, one per metric.
+
+    The difference of the means over logs, or their ratio; the standard error is the jackknife's over logs (for a difference:
+    the spread of the differences of single logs over the root of their number). None with fewer than two logs.
+    """
+    comparisons = []
+    for metric in metrics.split():
+        pairs = [tuple(entry["values"].get(m, {}).get(place, {}).get(metric, "") for m in (a, b)) for entry in logs]
+        known = [None if any(isinstance(value, str) for value in pair) else tuple(map(float, pair)) for pair in pairs]
+        both, of = [pair for pair in known if pair is not None], _ratio if metric in RATIOS else _difference
+        per_log = [None if pair is None else of([pair]) for pair in known]
+        where = "recorded path" if place == RECORDED else "off the recorded path"
+        comparisons.append({
+            "title": f"{a} against {b}, {where}: {COLUMNS[metric][0]}", "a": a, "b": b, "place": place, "metric": metric,
+            "kind": "ratio" if metric in RATIOS else "difference", "value": of(both) if both else None,
+            "standard_error": standard_error(of, both), "logs": len(both),
+            "per_log": [None if value is None else round(value, 5) for value in per_log],
+        })  # fmt: skip
+    return comparisons
 
 
-def _scores_of(job: LogJob, row: Row, views: Path) -> dict[str, Any]:
-    """A method's values by distance, from a score of its own against the common truth."""
-    settings = ScoreConfig(baseline=False, error_pictures=False, perceptual_views=PERCEPTUAL_VIEWS, device=job.config.device)
-    scene, truth, scored = job.out / "scene", job.out / "truth", job.out / "score" / row.name
-    made(lambda o: score.run(settings, scene, {row.name: views}, scored, truth=truth, overwrite=o), job.overwrite)
-    return {
-        f"{entry['distance_m']:g}": entry["values"] for entry in store.read_json(scored / "metrics.json")["by_distance"]
-    }
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
 
 
-def write_fill(scene: Path, fused: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
-    """The scorer's baseline on some trajectories as folders of views, so that it is a method like the others."""
-    refuse_overlap(out, {"scene": scene, "fused": fused})
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused)}
-    folder = RunDir.open(out, _FILL_OUTPUT, {"trajectories": [path.name for path in paths]}, inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    fill = score.baseline_of(read_scene(scene), read_fused(fused))
-    with log.task(FILL, sum(map(len, paths))) as bar:
-        for path in paths:
-            with ObservationWriter(folder.path / path.name, path.name, FILL) as writer:
-                for index, view in enumerate(path.views):
-                    writer.skip(view) if index < writer.done else writer.add(fill(view))
-                    bar.advance()
-    folder.finish({"trajectories": [path.name for path in paths]})
-    return folder.path
+def _difference(pairs: Sequence[tuple[float, float]]) -> float:
+    return _mean([a for a, _ in pairs]) - _mean([b for _, b in pairs])
 
 
-def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
-    """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
-    refuse_overlap(out, {"truth": truth})
-    shifted = [path.name for path in paths if path.origin == "shifted"]
-    folder = RunDir.open(out, _EXACT_OUTPUT, {"trajectories": shifted}, {"truth": store.digest(truth)}, overwrite)
-    if folder.complete:
-        return folder.reused()
-    for name in shifted:
-        views = read_observations(truth / name)
-        with ObservationWriter(folder.path / name, name, EXACT) as writer:
-            for index in range(len(views)):
-                seen = views[index]
-                writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
-    folder.finish({"trajectories": shifted})
-    return folder.path
+def _ratio(pairs: Sequence[tuple[float, float]]) -> float | None:
+    below = _mean([b for _, b in pairs])
+    return _mean([a for a, _ in pairs]) / below if below else None
+
+
+def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[Any]) -> float | None:
+    """Standard error of a statistic of independent items by leaving out each in turn; None for fewer than two items."""
+    count = len(items)
+    values = [of([*items[:i], *items[i + 1 :]]) for i in range(count)] if count > 1 else [None]
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    center = _mean(known)
+    return math.sqrt((count - 1) / count * sum((value - center) ** 2 for value in known))
+
+
+# ---- text ----
+
+
+def virtual_fits_of(settings: Mapping[str, Any]) -> str:
+    """How many iterations fits under virtual views have, as part of a sentence."""
+    share = settings["continued_share"]
+    more = "under virtual views {:g} times as many more after the fit on recorded views"
+    return more.format(share) if share else "those under virtual views too, from nothing"
+
+
+def _summary(settings: Mapping[str, Any]) -> str:
+    seen = " with renders of the fit on recorded views" if settings["renders"] else " without renders"
+    return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; generated{seen}"
+
+
+def markdown(doc: Mapping[str, Any]) -> str:
+    """The tables for people."""
+    settings = doc["settings"]
+    width, height = settings["size_px"]
+    lines = [
+        f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list", "",
+        f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
+        f"frame held out; {_summary(settings)}; seed {settings['seed']}. Means over both "
+        "sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped "
+        "codec, not LPIPS.", "",
+        *markdown_table(FACTS, map(_facts, doc["logs"])), "",
+    ]  # fmt: skip
+    headings = [heading for heading, _ in COLUMNS.values()]
+    names = [row["name"] for row in doc["methods"]]
+    for place in _places(doc):
+        rows = [[name, *_cells(doc["pooled"][name][place])] for name in names]
+        lines += [f"## {_place_title(doc, place)}", "", *markdown_table(["method", *headings], rows), ""]
+    lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
+    if "only_I" in names:
+        metrics = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
+        heads = ["virtual terms", *(COLUMNS[metric][0] for metric in metrics)]
+        rows = [[title, *_cells(doc["pooled"][name][SHIFTED], metrics, with_error=True)] for name, title in ABLATION_ROWS.items()]
+        lines += ["## Which virtual term does what", "", *markdown_table(heads, rows), ""]
+    for variant in doc["variants"]:
+        lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
+    rows = [[str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in doc["logs"] for name in names]
+    steps = dict.fromkeys(step for entry in doc["logs"] for step in entry["seconds"])
+    seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in doc["logs"])] for step in steps]
+    lines += ["## Each log, mean off the recorded path", "", *markdown_table(["log", "method", *headings], rows), ""]
+    lines += ["## Seconds per log", "", *markdown_table(["step", *(str(entry["log"]) for entry in doc["logs"])], seconds), ""]
+    return "\n".join(lines)
+
+
+def page(doc: Mapping[str, Any]) -> str:
+    """The whole page from what ``bench.json`` holds."""
+    settings, names = doc["settings"], [row["name"] for row in doc["methods"]]
+    *places, mean = _places(doc)
+    heads = ["method", *(heading for heading, _ in COLUMNS.values())]
+    compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
+    scores = [
+        Table.of_texts(heads, [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names], _place_title(doc, place))
+        for place in (mean, *places)
+    ]
+    videos = pages.films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
+    return pages.render(
+        f"Off the recorded path: {_logs_text(doc)}, {settings['list']} list", "mudg bench shift",
+        f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {_summary(settings)}. Means over logs and "
+        "both sides of the path.",
+        [
+            *([videos] if videos["films"] else []),
+            {"title": "Comparisons", "tables": [Table.of_texts(["", "value", "standard error", "as", "logs"], compared)]},
+            {"title": "Scores", "tables": scores},
+            {"title": "Logs", "tables": [Table.of_texts(FACTS, map(_facts, doc["logs"]))]},
+        ],
+        "The videos lie beside this page.",
+    )  # fmt: skip
+
+
+def _places(doc: Mapping[str, Any]) -> list[str]:
+    """The recorded path, the distances from it, and their mean."""
+    return [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]
+
+
+def _logs_text(doc: Mapping[str, Any]) -> str:
+    count = len(doc["logs"])
+    return f"{count} log{'s' if count != 1 else ''}"
+
+
+def _place_title(doc: Mapping[str, Any], place: str) -> str:
+    if place == RECORDED:
+        return "Recorded path, held-out frames"
+    if place == SHIFTED:
+        return "Mean over " + ", ".join(f"{d:g}" for d in sorted(doc["distances_m"])) + " m"
+    return f"{place} m to either side"
+
+
+def _cells(values: Mapping[str, Any], metrics: Sequence[str] = tuple(COLUMNS), with_error: bool = False) -> list[str]:
+    """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the reason for none."""
+    cells = []
+    for metric in metrics:
+        value, digits = values[metric], COLUMNS[metric][1]
+        if isinstance(value, Mapping):
+            error = value["standard_error"]
+            more = f" +- {error:.{digits}f}" if with_error and error is not None else ""
+            cells.append(f"{value['mean']:.{digits}f}{more}")
+        else:
+            cells.append(value if isinstance(value, str) else f"{value:.{digits}f}")
+    return cells
+
+
+FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
+
+
+def _facts(entry: Mapping[str, Any]) -> list[str]:
+    """Cells of a log's row under ``FACTS``."""
+    return [
+        str(entry["log"]), f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"]),
+        f"{entry['mover_share']:.1%}", entry["words"],
+    ]  # fmt: skip
+
+
+def _compared(comparison: Mapping[str, Any]) -> tuple[str, str]:
+    """A comparison's value and standard error as text."""
+    is_difference, error = comparison["kind"] == "difference", comparison["standard_error"]
+    digits, sign = (COLUMNS[comparison["metric"]][1], "+") if is_difference else (3, "")
+    if comparison["value"] is None:
+        return "no number", ""
+    return f"{comparison['value']:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"
+
+
+def _comparison_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    cells = []
+    for row in rows:
+        each = " ".join("-" if v is None else f"{v:.3g}" for v in row["per_log"])
+        cells.append([row["title"], *_compared(row), row["kind"], str(row["logs"]), each])
+    return markdown_table(["", "value", "standard error", "as", "logs", "each log"], cells)

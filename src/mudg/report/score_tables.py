@@ -8,6 +8,7 @@ from typing import Any, Final
 from mudg.base.errors import plain_lines
 from mudg.base.types import Scene
 from mudg.methods import METHODS
+from mudg.report import tables
 
 NO_TRUTH: Final = "no truth"
 NOT_REQUESTED: Final = "not requested"
@@ -188,10 +189,7 @@ def _mean(values: Sequence[float | str | None]) -> float | str:
 def best_of(better: str, values: Mapping[str, Any], metric: str) -> set[str]:
     """Methods whose shown value is the best one; none when fewer than two have a number."""
     numbers = {m: float(number_text(metric, v)) for m, v in values.items() if isinstance(v, int | float)}
-    if len(numbers) < 2:
-        return set()
-    best = max(numbers.values()) if better == "higher" else min(numbers.values())
-    return {m for m, v in numbers.items() if v == best}
+    return set(tables.best_of(better, numbers))
 
 
 def distance_title(document: Mapping[str, Any], distance_m: float) -> str:
@@ -277,7 +275,7 @@ def markdown(document: Mapping[str, Any]) -> str:
         rows = [[title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in shown)] for r in results]
         lines += ["", f"## {trajectory['name']}", ""]
         if any(isinstance(r["values"].get(n), float) for r in results for n in shown):
-            lines += markdown_table(["method", "views", *shown], rows)
+            lines += tables.markdown_table(["method", "views", *shown], rows)
             lines += ["", f"No truth here for {', '.join(unknown)}."] if unknown else []
         else:
             lines.append("Nothing to score against: there is no truth here.")
@@ -317,9 +315,3 @@ def _lines_of_anchors(document: Mapping[str, Any], trajectory: str) -> list[str]
         if anchor["trajectory"] == trajectory and found:
             lines.append(f"* {titles[anchor['metric']]}: {', '.join(found)}.")
     return ["", *lines] if lines else []
-
-
-def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    first, *others = ("| " + " | ".join(cells) + " |" for cells in (heads, *rows))
-    return [first, "|---" * len(heads) + "|", *others]

@@ -24,7 +24,7 @@ from mudg.base import log, palette, store
 from mudg.base.camera_colors import ColorMap
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, Scene, View
-from mudg.bench.real_protocols import Protocol
+from mudg.bench.places import Protocol
 from mudg.core import color_match, points_seen, trajectory
 from mudg.core.fusion import STATIC
 from mudg.core.pictures import class_colors, depth_colors
@@ -83,14 +83,7 @@ class Targets:
 
 
 def write_targets(
-    protocol: Protocol,
-    source: Path,
-    seen: Path,
-    held: Sequence[str],
-    cameras: Sequence[str],
-    out: Path,
-    *,
-    overwrite: bool = False,
+    protocol: Protocol, source: Path, seen: Path, held: Sequence[str], cameras: Sequence[str], out: Path, *, overwrite: bool = False
 ) -> Path:
     """Write the truth of a log under a protocol.
 
@@ -99,9 +92,9 @@ def write_targets(
         held: held-out frames, which are scored; empty = every frame of ``cameras``.
     """
     refuse_overlap(out, {"log": source, "shown": seen})
-    asked = {"protocol": asdict(protocol), "held_out": list(held), "cameras": list(cameras)}
+    settings = {"protocol": asdict(protocol), "held_out": list(held), "cameras": list(cameras)}
     inputs = {"log": store.digest(source), "shown": store.digest(seen)}
-    folder = RunDir.open(out, _OUTPUT, asked, inputs, overwrite)
+    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
     if folder.complete:
         return folder.reused()
     scene = read_scene(source)
@@ -151,17 +144,14 @@ def _written(
     maker: _Maker, by_camera: Mapping[str, Sequence[Frame]], out: Path
 ) -> tuple[list[dict[str, Any]], dict[str, str], dict[str, ColorMap]]:
     """Write the maps of all views; returns their records, the cameras left out with the reason, and the colour maps of cameras."""
-    protocol = maker.protocol
-    records: list[dict[str, Any]] = []
-    left_out: dict[str, str] = {}
-    color_maps: dict[str, ColorMap] = {}
+    protocol, records, left_out, color_maps = maker.protocol, [], {}, {}
     with log.task(f"truth of {protocol.name}", sum(map(len, by_camera.values()))) as bar:
         for name, frames in by_camera.items():
-            reason = maker.unsuitable(frames) if frames else "nothing of it is asked for"
-            if reason and frames:
+            reason = maker.unsuitable(frames) if frames else ""
+            if reason:
                 left_out[name] = reason
-            if "seen" in protocol.maps and not reason:
-                color_maps[name] = maker.color_map([f for i, f in enumerate(frames) if i % protocol.every == 0])
+            elif frames and "seen" in protocol.maps:
+                color_maps[name] = maker.color_map(frames[:: protocol.every])
             for number, frame in enumerate(frames):
                 bar.advance()
                 if reason or (protocol.every > 1 and number % protocol.every == 0):
@@ -170,14 +160,9 @@ def _written(
                     maps = maker.maps(frame, shift_m)
                     if maps is None:
                         continue
-                    record = {
-                        "place": f"{abs(shift_m):g} m" if shift_m else name,
-                        "frame": frame.id,
-                        "shift_m": shift_m,
-                    }
+                    record = {"place": f"{abs(shift_m):g} m" if shift_m else name, "frame": frame.id, "shift_m": shift_m}
                     if "seen" in maps:
-                        record["seen_px"] = int(maps["seen"].sum())
-                        record["seen_share"] = round(float(maps["seen"].mean()), 4)
+                        record |= {"seen_px": int(maps["seen"].sum()), "seen_share": round(float(maps["seen"].mean()), 4)}
                     store.write_safetensors(out / "maps" / f"{len(records):06d}.safetensors", maps)
                     records.append(record)
     return records, left_out, color_maps

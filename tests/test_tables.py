@@ -1,0 +1,59 @@
+"""Tables of text: one renderer for Markdown, LaTeX, CSV and pages."""
+
+import csv
+import io
+
+import pytest
+
+from mudg.report import html
+from mudg.report.tables import PUBLISHED, Cell, Line, Table, best_of, csv_text, latex, markdown, markdown_table
+
+TABLE = Table(
+    ("", "FID ↓", "a_b"),
+    (
+        Line("A paper's & method", (Cell("50.00"), Cell("")), PUBLISHED),
+        Line("the truth", (Cell("6.00"), Cell("-", reason="no weights")), "anchor"),
+        Line("ours (mudg_s)", (Cell("45 %", best=True), Cell("-", reason="no weights")), "ours"),
+    ),
+    "2 m",
+)
+
+
+def test_markdown_marks_the_best():
+    assert markdown(TABLE) == [
+        "|  | FID ↓ | a_b |", "|---|---|---|", "| A paper's & method | 50.00 |  |", "| the truth | 6.00 | - |",
+        "| ours (mudg_s) | **45 %** | - |",
+    ]  # fmt: skip
+    assert markdown_table(["a", "b"], []) == ["| a | b |", "|---|---|"]
+
+
+def test_latex_escapes_gives_reasons_and_sets_published_lines_apart():
+    assert latex(TABLE) == [
+        "% 2 m", "% -- a_b: no weights", r"\begin{tabular}{lrr}", r"\hline", r" & FID $\downarrow$ & a\_b \\", r"\hline",
+        r"A paper's \& method & 50.00 &  \\", r"\hline", r"the truth & 6.00 & -- \\", r"ours (mudg\_s) & \textbf{45 \%} & -- \\",
+        r"\hline", r"\end{tabular}",
+    ]  # fmt: skip
+
+
+def test_csv_quotes_what_it_must():
+    text = csv_text(["row", "value"], [["a, \"b\"", 0.5], ["c", ""]])
+    assert list(csv.reader(io.StringIO(text))) == [["row", "value"], ["a, \"b\"", "0.5"], ["c", ""]] and "\r" not in text
+
+
+def test_a_page_escapes_cells_and_marks_lines():
+    evil = Table(("", "n"), (Line("<script>", (Cell("<b>", best=True),), "n"),), "<i>")
+    text = html.render("bench.html.j2", title="t", kicker="k", lead="l", footer="", sections=[
+        {"title": "s", "tables": [TABLE, evil], "notes": [], "below": [], "films": [], "walls": [], "log_choices": [], "shift_choices": []},
+    ])  # fmt: skip
+    assert "<script>" not in text and '<tr class="n"><th scope="row">&lt;script&gt;</th><td><strong>&lt;b&gt;</strong></td></tr>' in text
+    assert '<tr class="published">' in text and "<h3>2 m</h3>" in text and "<h3>&lt;i&gt;</h3>" in text
+
+
+@pytest.mark.parametrize(("better", "best"), [("higher", ["b"]), ("lower", ["a"]), ("one", ["c"])])
+def test_the_best_of_a_column(better, best):
+    assert best_of(better, {"a": 0.4, "b": 1.3, "c": 0.9}) == best
+    assert best_of(better, {"a": 1.0}) == []
+
+
+def test_equal_numbers_are_all_best():
+    assert best_of("lower", {"a": 0.1, "b": 0.1, "c": 0.2}) == ["a", "b"]
