@@ -24,9 +24,32 @@ if TYPE_CHECKING:
     from mudg.core.raster.rasterize import rasterize
     from mudg.data.observations import read_observations
     from mudg.fitted import FittedScene, Picture, read_scene
+    from mudg.steps.functions import (
+        adapt,
+        annotate,
+        bench,
+        convert,
+        demo,
+        doctor,
+        edit,
+        export,
+        export_asset,
+        fit,
+        fuse,
+        import_asset,
+        ingest,
+        learn,
+        page,
+        render,
+        report,
+        run,
+        score,
+        synthesize,
+    )
 
 __version__ = "0.1.0"
 
+_FUNCTIONS = "mudg.steps.functions"
 _HOMES = {
     "Camera": "mudg.base.types",
     "FittedScene": "mudg.fitted",
@@ -43,14 +66,27 @@ _HOMES = {
     "rasterize": "mudg.core.raster.rasterize",
     "read_observations": "mudg.data.observations",
     "read_scene": "mudg.fitted",
+    "adapt": _FUNCTIONS,
+    "annotate": _FUNCTIONS,
+    "bench": _FUNCTIONS,
+    "convert": _FUNCTIONS,
+    "demo": _FUNCTIONS,
+    "doctor": _FUNCTIONS,
+    "edit": _FUNCTIONS,
+    "export": _FUNCTIONS,
+    "export_asset": _FUNCTIONS,
+    "fit": _FUNCTIONS,
+    "fuse": _FUNCTIONS,
+    "import_asset": _FUNCTIONS,
+    "ingest": _FUNCTIONS,
+    "learn": _FUNCTIONS,
+    "page": _FUNCTIONS,
+    "render": _FUNCTIONS,
+    "report": _FUNCTIONS,
+    "run": _FUNCTIONS,
+    "score": _FUNCTIONS,
+    "synthesize": _FUNCTIONS,
 }
-
-_VERBS = {
-    "adapt": "adapt", "annotate": "annotate", "bench": "bench", "convert": "convert", "demo": "demo", "doctor": "doctor", "edit": "edit",
-    "export": "export", "export_asset": "asset export", "fit": "fit", "fuse": "fuse", "import_asset": "asset import", "ingest": "ingest",
-    "learn": "learn", "page": "page", "render": "render", "report": "report", "run": "run", "score": "score", "synthesize": "synthesize",
-}  # fmt: skip
-"""Functions, and the verbs that they are."""
 
 __all__ = [
     "Camera",
@@ -100,12 +136,6 @@ def __getattr__(name: str) -> object:
         value = getattr(importlib.import_module(_HOMES[name]), name)
         globals()[name] = value
         return value
-    if name in _VERBS:
-        from mudg import steps
-        from mudg.steps.step import python_function
-
-        globals()[name] = python_function(steps.step_class(_VERBS[name]), name)
-        return globals()[name]
     raise AttributeError(f"module 'mudg' has no attribute {name!r}")
 
 

@@ -5,18 +5,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 import os
 import re
+import types
 from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import pytest
 
 import mudg
 from mudg import app, steps
-from mudg.steps import command
-from mudg.steps.step import flag_name, flag_of, options, signature
+from mudg.steps import command, functions
+from mudg.steps.step import documentation, flag_name, flag_of, options, signature
 
 HERE = Path(__file__).parent
 MAX_HELP_LINES = 45
@@ -43,9 +46,7 @@ def test_public_names_are_frozen() -> None:
 def test_flags_are_frozen() -> None:
     common = [flag_name(option.name) for option in command.common_options()]
     now = {
-        verb: sorted(
-            {flag_name(one.name) for one in options(steps.step_class(verb)) if not is_word(verb, one.name)} | {*common}
-        )
+        verb: sorted({flag_name(one.name) for one in options(steps.step_class(verb)) if not is_word(verb, one.name)} | {*common})
         for verb in steps.VERBS
     }
     assert now == frozen("cli.json", now)
@@ -96,13 +97,60 @@ def test_settings_stay_within_their_budget() -> None:
 def test_a_function_shows_its_settings_and_defaults() -> None:
     fit = inspect.signature(mudg.fit)
     assert list(fit.parameters)[:2] == ["scene", "fused"]
-    assert (
-        fit.parameters["out"].kind is inspect.Parameter.KEYWORD_ONLY
-        and fit.parameters["out"].default is inspect.Parameter.empty
-    )
+    assert fit.parameters["out"].kind is inspect.Parameter.KEYWORD_ONLY and fit.parameters["out"].default is inspect.Parameter.empty
     assert fit.parameters["iterations"].default == 2000 and "Optimisation steps" in (mudg.fit.__doc__ or "")
     for verb in steps.VERBS:
         assert signature(steps.step_class(verb)).parameters
+
+
+def stub() -> str:
+    """The signatures of all functions, for type checkers and editors."""
+    lines = ['"""Generated: `MUDG_UPDATE_FROZEN=1 pytest tests/house`."""', "", "from collections.abc import Mapping", "from pathlib import Path",
+             "from typing import Any, Literal"]  # fmt: skip
+    for name, verb in functions.VERBS.items():
+        lines += ["", f"def {name}("]
+        star = False
+        for parameter in signature(steps.step_class(verb)).parameters.values():
+            if parameter.kind is inspect.Parameter.KEYWORD_ONLY and not star:
+                lines, star = [*lines, "    *,"], True
+            default = "" if parameter.default is inspect.Parameter.empty else f" = {written(parameter.default)}"
+            lines.append(f"    {parameter.name}: {annotation(parameter.annotation)}{default},")
+        text = documentation(steps.step_class(verb)).replace("\\", "\\\\").replace("\n", "\n    ")
+        lines += [") -> Any:", *(line.rstrip() for line in f'    """{text}\n    """'.split("\n")), "    ..."]
+    return "\n".join(lines) + "\n"
+
+
+def annotation(kind: Any) -> str:
+    """A type as source text; paths may be text, and groups of settings mappings."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return annotation(inside[0])
+    if kind is Path:
+        return "str | Path"
+    if origin is Literal:
+        return f"Literal[{', '.join(map(repr, inside))}]"
+    if dataclasses.is_dataclass(kind):
+        return "Mapping[str, Any]"
+    if origin in (Union, types.UnionType):
+        return " | ".join("None" if one is type(None) else annotation(one) for one in inside)
+    if origin is tuple:
+        return f"tuple[{', '.join('...' if one is ... else annotation(one) for one in inside)}]"
+    if origin is not None:
+        return f"Mapping[{', '.join(annotation(one) for one in inside)}]"
+    return kind.__name__
+
+
+def written(value: Any) -> str:
+    """A default as source text."""
+    return repr(value) if isinstance(value, bool | int | float | str | tuple | None) else "..."
+
+
+def test_the_stub_of_the_functions_is_what_the_steps_say() -> None:
+    path = Path(functions.__file__ or "").with_suffix(".pyi")
+    if os.environ.get("MUDG_UPDATE_FROZEN"):
+        path.write_text(stub(), encoding="utf-8")
+    assert path.read_text(encoding="utf-8") == stub()
+    assert set(functions.VERBS) <= set(mudg.__all__)
 
 
 def test_the_overview_lists_every_verb() -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mudg.stages.config import RunConfig
     from mudg.stages.config.cost import SceneSize
 
-_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "tyro", "pyyaml", "rich", "av", "jinja2")
+_CORE = ("numpy", "scipy", "pillow", "safetensors", "pydantic", "pyyaml", "rich", "av", "jinja2")
 _OPTIONAL: Mapping[str, tuple[str, str]] = {
     # module: (what it is for, how to get it)
     "pyarrow": ("logs of Argoverse 2 and format 2 of Waymo", "pip install 'mudg[data]'"),

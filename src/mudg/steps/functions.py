@@ -1,0 +1,23 @@
+"""Verbs as functions: ``mudg.fit(...)``. Built from the steps on first use; what type checkers and editors read is in ``functions.pyi``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from mudg import steps
+from mudg.steps.step import python_function
+
+VERBS: Final = {
+    "adapt": "adapt", "annotate": "annotate", "bench": "bench", "convert": "convert", "demo": "demo", "doctor": "doctor", "edit": "edit",
+    "export": "export", "export_asset": "asset export", "fit": "fit", "fuse": "fuse", "import_asset": "asset import", "ingest": "ingest",
+    "learn": "learn", "page": "page", "render": "render", "report": "report", "run": "run", "score": "score", "synthesize": "synthesize",
+}  # fmt: skip
+"""Functions, and the verbs that they are."""
+
+
+def __getattr__(name: str) -> Callable[..., Any]:
+    if name not in VERBS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = python_function(steps.step_class(VERBS[name]), name)
+    return globals()[name]

@@ -1,0 +1,868 @@
+"""Generated: `MUDG_UPDATE_FROZEN=1 pytest tests/house`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+def adapt(
+    scene: str | Path,
+    fused: str | Path | None = None,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    fitted: str | Path | None = None,
+    config: str | Path | None = None,
+    model: str = 'embedded',
+    cameras: tuple[str, ...] = ('front',),
+    shifts_m: tuple[float, ...] = (2.5, -2.5),
+    gaps: bool = True,
+    block: int = 4,
+    held_out_every: int = 4,
+    fit_iterations: int = 150,
+    steps: int = 40,
+    batch_frames: int = 16,
+    lr: float = 0.0001,
+    trained: Literal['all', 'refiner'] = 'all',
+    augment: bool = True,
+    label_confidence: float = 0.5,
+    precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
+    device: str = 'auto',
+    processes: int = 0,
+    threads: int = 0,
+    seed: int = 0,
+) -> Any:
+    """Adapt the diffusion model to one recorded log, with the log's own photographs.
+
+    Args:
+        scene: Scene directory written by ingest or annotate, or folder of mudg run.
+        fused: Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE).
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        fitted: Gaussian scene written by fit, without virtual views (not given: that of the run at SCENE).
+        config: YAML file of settings, read before those given here.
+        model: Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must use renders.
+        cameras: Cameras whose photographs are learned (empty = the first camera).
+        shifts_m: Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate the photographs.
+        gaps: Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the other half.
+        block: Frames per training clip, and consecutive frames left out together.
+        held_out_every: Every n-th block of frames is kept for comparing the adapted model with the one it started from.
+        fit_iterations: Optimisation steps of each of the fits that the clips are made with.
+        steps: Training steps.
+        batch_frames: Frames per training step.
+        lr: Largest learning rate.
+        trained: Parts that are trained. refiner: refiner and finisher only.
+        augment: Vary the training clips in colour, and mirror them.
+        label_confidence: Labels of recorded images with a confidence below this, 0 to 1, are not given to the model.
+        precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere.
+        device: Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
+        processes: Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion model is not on the CPU). The result does not depend on it.
+        threads: Threads of the training (0 = one per core). Results are repeatable for the same number of threads.
+        seed: Seed of all random numbers; the same seed gives the same result.
+    """
+    ...
+
+def annotate(
+    scene: str | Path | None = None,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    list: str | Path | None = None,
+    shard: str = '',
+    jobs: int = 0,
+    config: str | Path | None = None,
+    labeller: Literal['embedded', 'geometry', 'network'] = 'embedded',
+    weights: str = '',
+    depth: bool = True,
+    depth_network: str = '',
+    depth_guided: bool = True,
+    depth_steps: int = 0,
+    device: str = 'auto',
+    precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
+    sweeps: int = 6,
+    dynamic: bool = True,
+    ego: bool = False,
+    processes: int = 0,
+) -> Any:
+    """Add missing labels to a scene: semantics, sky and depth, with confidences.
+
+    Args:
+        scene: Scene directory written by ingest, or folder of mudg run.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
+        shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.
+        jobs: With --list: number of scenes processed at the same time (0 = one per processor).
+        config: YAML file of settings, read before those given here.
+        labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on heights and boxes, without a network. network: a segmentation network from `weights`.
+        weights: labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
+        depth: Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide.
+        depth_network: Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything, Depth Anything (transformers) or Marigold (diffusers) model; or folder of a DepthLab written by mudg convert.
+        depth_guided: Marigold: use LiDAR in every denoising step (slower). Off: only align the result to LiDAR.
+        depth_steps: Marigold and DepthLab: denoising steps (0 = as in the model folder, or 50 for Marigold guided by LiDAR).
+        device: Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
+        precision: Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4 percent.
+        sweeps: Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth.
+        dynamic: Write masks of dynamic objects, from the tracked boxes.
+        ego: Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet is visible.
+        processes: Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device).
+    """
+    ...
+
+def bench(
+    name: str,
+    sources: tuple[str | Path, ...] = (),
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    preset: Literal['fast', 'default', 'quality', 'paper'] = 'default',
+    config: str | Path | None = None,
+    model: str = 'embedded',
+    cities: Literal['reported', 'development'] = 'reported',
+    count: int = 6,
+    steps: tuple[int, ...] = (1, 2, 8),
+    sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
+    eta: float | None = None,
+    precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
+    harmonize: bool = False,
+    threads: int = 1,
+    seed: int = 0,
+    list: Literal['development', 'reported'] = 'development',
+    logs: int = 8,
+    methods: tuple[str, ...] = ('nearest_fill', 'gs3d', 'street_gaussians', 'mudg_r', 'mudg_s'),
+    iterations: int = 1000,
+    continue_fit: bool = True,
+    ablation: bool = False,
+    variant: tuple[str, ...] = (),
+    processes: int = 0,
+    videos: bool = True,
+    table: Literal['mudg1', 'mudg2', 'mudg3', 'recondreamer', 'drivedreamer4d', 'streetcrafter', 'freesim', 'recam', 'spvc', 'panda', 'dist'] = 'mudg1',
+    freevs_model: str = '',
+    protocols: tuple[str, ...] = ('gap', 'camera', 'lidar', 'classes'),
+    shown: tuple[str, ...] = (),
+    resolution: str = '',
+    frames: str = '',
+    pose_iterations: int = 300,
+    device: str = 'auto',
+    fuse: Mapping[str, Any] = ...,
+    synthesize: Mapping[str, Any] = ...,
+    fit: Mapping[str, Any] = ...,
+    score: Mapping[str, Any] = ...,
+) -> Any:
+    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.
+
+    Args:
+        name: Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off the recorded path), real (complete methods on real logs) or paper (a table of a paper).
+        sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        preset: shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
+        config: YAML file of settings, read before those given here.
+        model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
+        cities: mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
+        count: mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the recorded path.
+        steps: mdm: numbers of denoising steps to compare; each is measured on its own.
+        sampler: mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and likewise steps and eta.
+        eta: mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
+        precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16: published-type models on CUDA devices (shift, real, paper).
+        harmonize: edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them.
+        threads: mdm, poses, edit: number of torch threads.
+        seed: Seed of all random numbers; the same seed gives the same result.
+        list: shift: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
+        logs: shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
+        methods: shift, real: methods to compare: those of the default; pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input. paper: any of these of shift, and freevs; with the default, all of them.
+        iterations: shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more.
+        continue_fit: shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
+        ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add the rows without adaptation and without renders.
+        variant: shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such as virtual.color_weight. Both of its fits have them.
+        processes: shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
+        videos: shift, paper: also write videos of all methods side by side.
+        table: paper: the table to fill (docs/paper_tables.md).
+        freevs_model: paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers).
+        protocols: real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone.
+        shown: real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front, or the first camera).
+        resolution: real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list of cities: WIDTHxHEIGHT (empty = 384x256).
+        frames: real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says). paper with a list of cities: 0:END (empty = 0:24).
+        pose_iterations: poses, edit: optimisation steps of every fit.
+        device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N.
+        fuse: shift, real, paper: how the clouds of every log are made.
+        synthesize: shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from).
+        fit: shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags.
+        score: paper: how every row is scored; files of weights are given here.
+    """
+    ...
+
+def convert(
+    checkpoint: str | Path,
+    *,
+    to: str | Path,
+    overwrite: bool = False,
+    config: str | Path | None = None,
+    network: Literal['diffusion', 'inception', 'i3d', 'dinov2', 'clip', 'lpips', 'lpips-vgg', 'lpips-squeeze'] = 'diffusion',
+    resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
+    dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
+    towers: str = '',
+    shard_mb: int = 1024,
+    memory_gb: float = 0.0,
+) -> Any:
+    """Convert a published checkpoint to a folder for synthesize, annotate or score.
+
+    Args:
+        checkpoint: Checkpoint file of MuDG, DynamiCrafter-512 or DynamiCrafter-1024 (.ckpt, .pt or .safetensors); or, for DepthLab, the folder that contains DepthLab's files, Marigold's folder and the image encoder's folder; or, with --network, weights of a network of the scores.
+        to: Model folder to write.
+        overwrite: Replace the model that --to already holds. The old model stays until the new one is finished, so the disk must hold both. Files that do not belong to the model are kept.
+        config: YAML file of settings, read before those given here.
+        network: What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings apply to diffusion models only.
+        resolution: Image height x width that the checkpoint was trained at. auto: from 512 or 1024 in the file's name.
+        dtype: Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights.
+        towers: OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own).
+        shard_mb: Largest size of one weight file, in MB.
+        memory_gb: Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 = derived from the file's size). Raise it if the conversion runs out of memory.
+    """
+    ...
+
+def demo(
+    *,
+    out: str | Path = ...,
+    overwrite: bool = False,
+    preset: Literal['fast', 'default', 'quality', 'paper'] | None = None,
+    fast: bool = False,
+    seed: int | None = None,
+    shifts_m: tuple[float, ...] = (),
+    config: str | Path | None = None,
+    adaptation: Literal['auto', 'on', 'off'] = 'auto',
+    device: str = 'auto',
+    continue_fit: bool = True,
+    ingest: Mapping[str, Any] = ...,
+    annotate: Mapping[str, Any] = ...,
+    fuse: Mapping[str, Any] = ...,
+    adapt: Mapping[str, Any] = ...,
+    synthesize: Mapping[str, Any] = ...,
+    fit: Mapping[str, Any] = ...,
+    render: Mapping[str, Any] = ...,
+    score: Mapping[str, Any] = ...,
+) -> Any:
+    """Run all steps on the built-in city and write a report page.
+
+    Args:
+        out: Folder to write. Repeat the same command to resume an interrupted demo.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
+        fast: The same as --preset fast, 3 m to each side: one to two minutes on 2 cores.
+        seed: Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
+        shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
+        config: YAML file of settings, read before those given here.
+        adaptation: Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for generated cities.
+        device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
+        continue_fit: Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
+        ingest:
+        annotate:
+        fuse:
+        adapt:
+        synthesize:
+        fit:
+        render:
+        score:
+    """
+    ...
+
+def doctor(
+    scene: str | Path | None = None,
+) -> Any:
+    """Report what this machine offers, or check a scene or log for errors.
+
+    Args:
+        scene: Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this machine).
+    """
+    ...
+
+def edit(
+    source: str | Path,
+    script: str | Path,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    scene: str | Path | None = None,
+    fused: str | Path | None = None,
+    config: str | Path | None = None,
+    changed_above: float = 0.01568627450980392,
+    grow_px: int = 2,
+    harmonize: Mapping[str, Any] = ...,
+    raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
+    device: str = 'auto',
+) -> Any:
+    """Change a drive as an edit script says: remove, move, insert, change lanes, weather and light.
+
+    Args:
+        source: Gaussian scene written by fit, or folder of a finished mudg run.
+        script: Edit script (docs/edit.md).
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        scene: Scene directory that a Gaussian scene was fitted to. With it, the vehicle's path and parked objects can be edited. A run has its own.
+        fused: Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its own.
+        config: YAML file of settings, read before those given here.
+        changed_above: Images of an edited run keep the recorded pixels where renders with and without the edits differ by less than this, 0 to 1.
+        grow_px: The rest is grown by this many pixels, and comes from the render of the edited scene.
+        harmonize: Of a whole run: let the diffusion model repair what the edits touch in its images.
+        raster: Rasteriser backend. auto picks the fastest one available and prints its name.
+        device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
+    """
+    ...
+
+def export(
+    format: str,
+    source: str | Path,
+    *,
+    out: str | Path,
+    scene: str | Path | None = None,
+    edits: str | Path | None = None,
+    overwrite: bool = False,
+    config: str | Path | None = None,
+    time_s: float | None = None,
+    animated: bool = False,
+    nodes: tuple[str, ...] = (),
+    axes: Literal['viewer', 'world'] = 'viewer',
+    sky: Literal['keep', 'none', 'sphere'] = 'keep',
+    spz_version: Literal[3, 4] = 3,
+) -> Any:
+    """Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP.
+
+    Args:
+        format: Gaussians: ply, bundle, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text. The log over time: mcap, ros2, rerun, ncore.
+        source: Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory.
+        out: File to write, with the suffix of the format; for cameras, ros2 and ncore, folder to write.
+        scene: Scene directory that a Gaussian scene was fitted to. A run has its own.
+        edits: Edit script (docs/edit.md) to carry out before.
+        overwrite: Replace the output if it exists.
+        config: YAML file of settings, read before those given here.
+        time_s: Moment at which moving objects are taken, on the scene's clock (not given: formats with motion hold all of it, others the middle of the log).
+        animated: Require that the file holds the motion: a format that cannot is refused.
+        nodes: Track ids of the objects to write, and background for what stands (not given: everything).
+        axes: viewer: axes that programs expect of the format. world: x forward, y left, z up in every format.
+        sky: keep: a panorama, in formats that hold one. none: no sky. sphere: 6000 flat Gaussians 300 m away, in every format.
+        spz_version: Version of spz. 4 needs the package zstandard.
+    """
+    ...
+
+def export_asset(
+    source: str | Path,
+    track_id: str,
+    *,
+    out: str | Path,
+    scene: str | Path | None = None,
+    overwrite: bool = False,
+) -> Any:
+    """Write one object of a fitted scene to a file that edit scripts can insert.
+
+    Args:
+        source: Gaussian scene written by fit, or folder of a finished mudg run.
+        track_id: Track id of a dynamic object.
+        out: File to write.
+        scene: Scene directory that a Gaussian scene was fitted to; it tells from which sides the object was seen. A run has its own.
+        overwrite: Replace the output if it exists.
+    """
+    ...
+
+def fit(
+    scene: str | Path,
+    fused: str | Path | None = None,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    observations: tuple[str | Path, ...] = (),
+    start_from: str | Path | None = None,
+    config: str | Path | None = None,
+    method: Literal['gs3d', 'street_gaussians', 'pvg', 'omnire', 's3gaussian', 'bezier', 'emernerf', 'difix', 'mudg_s'] = 'mudg_s',
+    iterations: int = 2000,
+    seed: int = 0,
+    cameras: tuple[str, ...] = (),
+    width_px: int = 0,
+    sh_degree: int = 0,
+    semantics: bool = True,
+    raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
+    device: str = 'auto',
+    checkpoint_every: int = 500,
+    preview_every: int = 500,
+    start: Mapping[str, Any] = ...,
+    densify: Mapping[str, Any] = ...,
+    objects: Mapping[str, Any] = ...,
+    hexplane: Mapping[str, Any] = ...,
+    poses: Mapping[str, Any] = ...,
+    appearance: Mapping[str, Any] = ...,
+    drawing: Mapping[str, Any] = ...,
+    loss: Mapping[str, Any] = ...,
+    virtual: Mapping[str, Any] = ...,
+    radiance: Mapping[str, Any] = ...,
+) -> Any:
+    """Fit a dynamic 3D Gaussian scene to recorded (and virtual) views.
+
+    Args:
+        scene: Scene directory written by ingest or annotate, or folder of mudg run.
+        fused: Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        observations: Virtual views written by synthesize, in one folder or several; required by method mudg_s.
+        start_from: Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views are used from the first of them on.
+        config: YAML file of settings, read before those given here.
+        method: What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, supervised by virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier, difix (which learns from repaired renders): published methods for comparison (docs/baselines.md).
+        iterations: Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt to this number. With `--start-from`: further steps, the second half of a schedule of twice as many.
+        seed: Seed of all random numbers; the same seed gives the same result.
+        cameras: Cameras whose recorded images are fitted (empty = all).
+        width_px: Image width in pixels while fitting; the height follows (0 = as recorded). Lower it to save time and memory.
+        sh_degree: Degree of the spherical harmonics for view-dependent colour. On short drives every degree above 0 overfits to the recorded path.
+        semantics: Learn semantic classes where the scene has labels.
+        raster: Rasteriser backend. auto picks the fastest one available and prints its name.
+        device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
+        checkpoint_every: Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a twentieth of the time.
+        preview_every: Steps between preview images.
+        start:
+        densify:
+        objects:
+        hexplane:
+        poses:
+        appearance:
+        drawing:
+        loss:
+        virtual:
+        radiance:
+    """
+    ...
+
+def fuse(
+    scene: str | Path | None = None,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    list: str | Path | None = None,
+    shard: str = '',
+    jobs: int = 0,
+    config: str | Path | None = None,
+    voxel_m: float = 0.0,
+    occlusion_test: bool = True,
+    max_image_gap_s: float = 0.06,
+    match_colors: bool = True,
+    color_from_held_out: bool = False,
+    box_growth_m: float = 0.1,
+    floor_margin_m: float = 0.1,
+    moving_distance_m: float = 0.5,
+    min_object_points: int = 100,
+) -> Any:
+    """Fuse LiDAR and images: a static coloured point cloud, one more per dynamic object.
+
+    Args:
+        scene: Scene directory written by ingest or annotate, or folder of mudg run.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
+        shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.
+        jobs: With --list: number of scenes processed at the same time (0 = one per processor).
+        config: YAML file of settings, read before those given here.
+        voxel_m: Keep one point per voxel of this size, in metres (0 = keep all).
+        occlusion_test: Do not colour points that lie behind a nearer surface.
+        max_image_gap_s: A sweep's points are coloured only from images within this time, in seconds.
+        match_colors: Find how exposure and white balance differ between cameras, from points that several of them saw, and correct it in clouds, fits and generated views. A camera's own views keep its colours.
+        color_from_held_out: Also take colours from held-out images. Scores at held-out frames are then not meaningful.
+        box_growth_m: Boxes of dynamic objects are enlarged by this distance on each side, in metres. Raise it if objects leave points behind.
+        floor_margin_m: Points up to this height, in metres, above the bottom of a dynamic object's box stay with the road.
+        moving_distance_m: A tracked box is dynamic if its displacement or its path is longer than this, in metres.
+        min_object_points: Dynamic objects with fewer coloured points than this are left out.
+    """
+    ...
+
+def import_asset(
+    file: str | Path,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    config: str | Path | None = None,
+    kind: Literal['object', 'scene'] = 'object',
+    label: str = 'object',
+    length_m: float | None = None,
+    yaw_deg: float = 0.0,
+    origin_m: tuple[float, float, float] | None = None,
+    axes: str = 'file',
+) -> Any:
+    """Make an object, or a scene, of a file of Gaussians from another program.
+
+    Args:
+        file: File of Gaussians (.ply, .spz, .splat, .sog, .glb).
+        out: File to write; with --kind scene, folder to write.
+        overwrite: Replace the output if it exists.
+        config: YAML file of settings, read before those given here.
+        kind: object: an asset file. scene: the folder of a fit in which nothing moves.
+        label: Class of the object, e.g. car or pedestrian.
+        length_m: Scale the object so that its box has this length (not given: the file is in metres).
+        yaw_deg: Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads, along x.
+        origin_m: With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own origin, or the middle of Gaussians that lie more than 16 km away). As a background of an edit script, a street begins there.
+        axes: Where x, y and z of the file point. file: as the file says, else as viewer. viewer: as programs expect of its format. world: x forward, y left, z up, as of export --axes world. Or three letters of L, R, U, D, F, B: RDF is x right, y down, z forward.
+    """
+    ...
+
+def ingest(
+    log: str = '',
+    *,
+    out: str | Path = ...,
+    overwrite: bool = False,
+    list: str | Path | None = None,
+    shard: str = '',
+    jobs: int = 0,
+    config: str | Path | None = None,
+    resolution: str = '',
+    workers: int = 0,
+    contact_sheet: bool = True,
+    test_every: int = 4,
+    format: str = 'auto',
+    frames: str = '',
+    cameras: tuple[str, ...] = (),
+    sequence: str = '',
+    poses: str = '',
+    boxes: str = '',
+    skip_missing: bool = False,
+    bridge_gaps: bool = False,
+    untwist: Literal['auto', 'yes', 'no'] = 'auto',
+    city: Mapping[str, Any] = ...,
+) -> Any:
+    """Convert a driving log, or the built-in city, to a scene directory.
+
+    Args:
+        log: LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not recognised. OUT: the folder to write, in place of --out.
+        out: Folder to write, if it is not given after LOG. A finished result of the same settings and inputs is reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
+        shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.
+        jobs: With --list: number of scenes processed at the same time (0 = one per processor).
+        config: YAML file of settings, read before those given here.
+        resolution: Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never enlarged.
+        workers: Threads that convert frames (0 = one per processor). The result does not depend on it.
+        contact_sheet: Write contact_sheet.jpg: frames with LiDAR points and boxes, and the scene from above. Check it after every import.
+        test_every: Hold out every n-th frame of all cameras for scoring (0 = none).
+        format: Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto = recognise it).
+        frames: Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers of their files; other formats: counted from 0.
+        cameras: Cameras to import, by their names in the scene or in the dataset (empty = the format's default cameras).
+        sequence: Log, sequence, scene or frame to import, if the folder holds several.
+        poses: File (or folder of GPS/IMU packets) with vehicle poses (empty = search in the log).
+        boxes: File with tracked boxes (empty = search in the log).
+        skip_missing: Skip frames with a missing image, scan or vehicle pose instead of refusing the log.
+        bridge_gaps: Bridge gaps between vehicle poses with curves instead of refusing the frames in them.
+        untwist: Compensate LiDAR scans for the vehicle's motion during a sweep (auto = if the dataset's scans need it).
+        city:
+    """
+    ...
+
+def learn(
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    config: str | Path | None = None,
+    seed: int = 0,
+    start: str = '',
+    steps: int = 2800,
+    frozen: Literal['nothing', 'temporal_transformers', 'temporal_layers', 'denoiser'] = 'nothing',
+    precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
+    threads: int = 1,
+    data: Mapping[str, Any] = ...,
+    network: Mapping[str, Any] = ...,
+    codec: Mapping[str, Any] = ...,
+    optimizer: Mapping[str, Any] = ...,
+    loss: Mapping[str, Any] = ...,
+    score: Mapping[str, Any] = ...,
+    compute: Mapping[str, Any] = ...,
+) -> Any:
+    """Train a diffusion model on generated cities, or fine-tune one on your own logs.
+
+    Args:
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        config: YAML file of settings, read before those given here.
+        seed: Seed of the cities, the initial weights and all other random numbers.
+        start: Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from scratch).
+        steps: Training steps of the network.
+        frozen: Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that mix frames. denoiser: train the refiner only.
+        precision: Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere.
+        threads: Threads of the training process. Results are repeatable for the same number of threads.
+        data:
+        network:
+        codec:
+        optimizer:
+        loss:
+        score:
+        compute:
+    """
+    ...
+
+def page(
+    source: str | Path,
+    *,
+    out: str | Path,
+    scene: str | Path | None = None,
+    compare: str | Path | None = None,
+    overwrite: bool = False,
+    config: str | Path | None = None,
+    method: str = '',
+    budget: int = 3000000,
+    memory_mb: int = 0,
+    image_width_px: int = 320,
+    images: int = 150,
+    lidar_points: int = 20000,
+) -> Any:
+    """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network.
+
+    Args:
+        source: Folder of a finished mudg run, or Gaussian scene written by fit.
+        out: Page to write: one file. Above 32 MB, a folder FILE_page beside it, for a web server.
+        scene: Scene directory that a Gaussian scene was fitted to. A run has its own.
+        compare: A second run or fit of the same log, to compare with. The same run: its two fits.
+        overwrite: Replace the page if it exists.
+        config: YAML file of settings, read before those given here.
+        method: Fit of a run to show (empty = the best one: mudg_s, else street_gaussians).
+        budget: Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and faintest are left out.
+        memory_mb: Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit). Gaussians are left out as for the budget.
+        image_width_px: Width of recorded images on the page, pixels (0 = none).
+        images: Most recorded images on the page, taken evenly.
+        lidar_points: Most LiDAR points on the page, taken evenly from all sweeps.
+    """
+    ...
+
+def render(
+    scene: str | Path,
+    model: str | Path | None = None,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    edits: str | Path | None = None,
+    fused: str | Path | None = None,
+    config: str | Path | None = None,
+    cameras: tuple[str, ...] = ('front',),
+    shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0),
+    paths: tuple[str, ...] = (),
+    height_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    width_px: int = 0,
+    remove_tracks: tuple[str, ...] = (),
+    sky_below_alpha: float = 0.5,
+    video: bool = True,
+    fps: float = 10.0,
+    harmonize: Mapping[str, Any] = ...,
+    raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
+    device: str = 'auto',
+) -> Any:
+    """Render RGB, depth and semantics of a fitted scene on shifted trajectories.
+
+    Args:
+        scene: Scene directory that the Gaussian scene was fitted to, or folder of mudg run.
+        model: Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at SCENE).
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        edits: Edit script (docs/edit.md) to carry out before rendering.
+        fused: Point clouds written by fuse; for --harmonize.on.
+        config: YAML file of settings, read before those given here.
+        cameras: Cameras to render (empty = the first camera). A name that the scene lacks is an error.
+        shifts_m: Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path.
+        paths: Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower.
+        height_m: Vertical shift in metres, positive upwards; applies to every shift.
+        yaw_deg: Yaw in degrees, counter-clockwise seen from above; applies to every shift.
+        width_px: Image width in pixels (0 = as recorded); the height follows.
+        remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
+        sky_below_alpha: Pixels whose opacity is below this, 0 to 1, become sky: class sky, no depth.
+        video: Also write one MP4 video per trajectory.
+        fps: Frames per second of the videos.
+        harmonize: With an edit script: let the diffusion model repair what the edits touch.
+        raster: Rasteriser backend. auto picks the fastest one available and prints its name.
+        device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
+    """
+    ...
+
+def report(
+    runs: tuple[str | Path, ...],
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+) -> Any:
+    """Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter.
+
+    Args:
+        runs: Folders of mudg run, score or bench; of any other folder, the folders in it.
+        out: Page to write.
+        overwrite: Replace the page if it exists.
+    """
+    ...
+
+def run(
+    source: str,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    preset: Literal['fast', 'default', 'quality', 'paper'] | None = None,
+    fast: bool = False,
+    seed: int | None = None,
+    cameras: tuple[str, ...] = (),
+    shifts_m: tuple[float, ...] = (),
+    config: str | Path | None = None,
+    adaptation: Literal['auto', 'on', 'off'] = 'auto',
+    device: str = 'auto',
+    continue_fit: bool = True,
+    ingest: Mapping[str, Any] = ...,
+    annotate: Mapping[str, Any] = ...,
+    fuse: Mapping[str, Any] = ...,
+    adapt: Mapping[str, Any] = ...,
+    synthesize: Mapping[str, Any] = ...,
+    fit: Mapping[str, Any] = ...,
+    render: Mapping[str, Any] = ...,
+    score: Mapping[str, Any] = ...,
+) -> Any:
+    """Run all steps on your own driving log or scene and write a report page.
+
+    Args:
+        source: Folder of a dataset log (its format is recognised), a scene directory, or the word city.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side, no adaptation. One to two minutes on 2 cores for 16 frames of one camera; a line at the start forecasts what it takes here.
+        seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
+        cameras: Cameras for which shifted trajectories are made (not given: the first camera).
+        shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
+        config: YAML file of settings, read before those given here.
+        adaptation: Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for generated cities.
+        device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
+        continue_fit: Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
+        ingest:
+        annotate:
+        fuse:
+        adapt:
+        synthesize:
+        fit:
+        render:
+        score:
+    """
+    ...
+
+def score(
+    scene: str | Path,
+    views: Mapping[str, str | Path],
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    fused: str | Path | None = None,
+    config: str | Path | None = None,
+    width_px: int = 0,
+    baseline: bool = True,
+    perceptual_views: int = 8,
+    lpips_weights: str = '',
+    lpips_vgg_weights: str = '',
+    lpips_squeeze_weights: str = '',
+    lpips_input: Literal['correct', 'unscaled'] = 'correct',
+    fid_weights: str = '',
+    fid_resize: Literal['pytorch-fid', 'tf1', 'clean', 'tm', 'neurad'] = 'pytorch-fid',
+    fvd_weights: str = '',
+    fvd_resize: Literal['videogpt', 'google', 'stylegan-v'] = 'videogpt',
+    dino_weights: str = '',
+    clip_weights: str = '',
+    video_features: str = '',
+    detections: str = '',
+    lanes: str = '',
+    as_published: bool = False,
+    error_pictures: bool = True,
+    device: str = 'auto',
+) -> Any:
+    """Compare views with ground truth: metrics, tables, error images.
+
+    Args:
+        scene: Scene directory that the views belong to, or folder of mudg run.
+        views: Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE without the flag.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        fused: Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline).
+        config: YAML file of settings, read before those given here.
+        width_px: Image width in pixels at which everything is compared; the height follows (0 = the size of the scene's camera).
+        baseline: Also score a baseline without learning: the fused points, with every hole filled by the nearest point.
+        perceptual_views: Number of views per trajectory, evenly spread, at which the perceptual distance is computed (0 = none). It costs more than all other metrics together.
+        lpips_weights: Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package). LPIPS is computed at the same views as the perceptual distance (empty = not computed).
+        lpips_vgg_weights: The same for LPIPS with VGG-16 (empty = not computed).
+        lpips_squeeze_weights: The same for LPIPS with SqueezeNet 1.1 (empty = not computed).
+        lpips_input: Range of the colours that LPIPS gets. unscaled: 0 to 1 where -1 to 1 belongs, as much published code of Gaussian scenes has it; only to compare with its numbers.
+        fid_weights: File with the weights of FID's Inception-v3 network (`pt_inception-2015-12-05-6726825d.pth`, or its tensors as safetensors). FID and KID then compare all views with the recorded frames of the same camera (empty = not computed).
+        fid_resize: How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean), torchmetrics (tm) or neurad-studio (neurad) do it. Numbers of different rules cannot be compared.
+        fvd_weights: File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or the TorchScript archive. FVD then compares clips of 16 views with those of the recorded video of the same camera (empty = not computed).
+        fvd_resize: How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google, stylegan-v).
+        dino_weights: File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`, `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then computed (empty = not computed).
+        clip_weights: File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not computed).
+        video_features: Folder with features of clips that an extractor of your own made: METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor `features` of [clips, values]. Frechet and polynomial distances are then computed (empty = not computed).
+        detections: File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not computed).
+        lanes: Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed (empty = not computed). Generated cities only: prepared logs have no lane lines.
+        as_published: NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting them at the near plane.
+        error_pictures: Write an image of the colour error at the middle view of every trajectory.
+        device: Device of the networks behind perceptual distance, LPIPS, FID, FVD, DINOv2 and CLIP: auto (CUDA if there is one), cpu, cuda, cuda:N. All other metrics run on the CPU.
+    """
+    ...
+
+def synthesize(
+    scene: str | Path,
+    fused: str | Path | None = None,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    fitted: str | Path | None = None,
+    edits: str | Path | None = None,
+    config: str | Path | None = None,
+    cameras: tuple[str, ...] = ('front',),
+    shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0),
+    paths: tuple[str, ...] = (),
+    model: str = 'embedded',
+    steps: int = 2,
+    sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
+    eta: float | None = None,
+    samples: int = 1,
+    condition: Literal['full', 'reference', 'points', 'concat', 'freevs', 'repair'] = 'full',
+    given_classes: bool = True,
+    label_confidence: float = 0.5,
+    align_depth: bool = True,
+    overlap: int = 2,
+    width_px: int = 0,
+    full_size: bool = True,
+    held_out_images: bool = False,
+    precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
+    device: str = 'auto',
+    processes: int = 0,
+    guidance: float | None = None,
+    guidance_rescale: float | None = None,
+    memory_budget_gb: float = 0.0,
+    offload: bool = False,
+    compiled: bool = False,
+    seed: int = 0,
+) -> Any:
+    """Generate dense RGB, depth and semantics on laterally shifted trajectories.
+
+    Args:
+        scene: Scene directory written by ingest or annotate, or folder of mudg run.
+        fused: Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE).
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        fitted: Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were trained with renders.
+        edits: Edit script (docs/edit.md): make views of the drive as it says.
+        config: YAML file of settings, read before those given here.
+        cameras: Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error.
+        shifts_m: Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path.
+        paths: Further paths by name: up+1, lane+0.1, speed-0.1, ..., as for render.
+        model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
+        steps: Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type models.
+        sampler: Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step.
+        eta: Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
+        samples: Samples per clip. The first one is kept; the spread of all of them lowers the confidence. Time grows with this number.
+        condition: Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. freevs: the condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair: renders of `--fitted` and the nearest recorded image, without points; gives colour alone.
+        given_classes: Use the classes of labelled points and recorded images in the model's condition, if the scene has labels.
+        label_confidence: Labels of recorded images with a confidence below this, 0 to 1, are not used.
+        align_depth: Align generated depth to the LiDAR points in the same view (one scale and one shift per frame).
+        overlap: Frames that a window of the model shares with the previous window; they are kept, so that the video continues smoothly. Published-type models: 8.
+        width_px: Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect ratio).
+        full_size: Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from warped recorded images. Off: at the size the model works at.
+        held_out_images: Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful.
+        precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as in the release.
+        device: Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
+        processes: Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models, and where the diffusion model is not on the CPU).
+        guidance: Published-type models: scale of classifier-free guidance; 1 = none, which halves the work (not given: 7.5).
+        guidance_rescale: Published-type models: guidance rescale, 0 (off) to 1; limits overexposure by guidance (not given: 0.7).
+        memory_budget_gb: Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device; elsewhere do not split). The result stays the same.
+        offload: Published-type models: keep the image tower (1.3 GB in bfloat16) on the CPU except while it reads a reference. Done without being asked where a memory budget needs it.
+        compiled: Published-type models: compile the denoising network (torch.compile). The first step then takes minutes, further ones less.
+        seed: Seed of the noise.
+    """
+    ...
