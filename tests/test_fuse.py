@@ -441,13 +441,6 @@ def test_stage_writes_reuses_and_refuses(tmp_path: Path) -> None:
         fuse.run(FuseConfig(voxel_m=0.2), tmp_path / "scene", out)
 
 
-def test_stage_uses_held_out_images_only_when_told(tmp_path: Path) -> None:
-    ToyStreet().write(tmp_path / "scene")
-    plain = read_fused(fuse.run(FuseConfig(), tmp_path / "scene", tmp_path / "a"))
-    more = read_fused(fuse.run(FuseConfig(color_from_held_out=True), tmp_path / "scene", tmp_path / "b"))
-    assert len(more.static) > 1.2 * len(plain.static)
-
-
 def test_a_changed_cloud_is_noticed(tmp_path: Path) -> None:
     none = np.zeros((3, 3))
     cloud = PointCloud(none.astype(np.float32), none.astype(np.uint8), "world")

@@ -345,8 +345,8 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
         assert np.array_equal(image[~mask], read_image(old, recorded)[~mask])
         differ += int((image != read_image(other, rendered)).any(-1).sum())
     assert differ > 0
-    photos = synthesize.recorded_images(scene, SynthesizeConfig(held_out_images=True))
-    assert all(np.array_equal(~p.usable, read_label(scene, f, "rendered")) for p, f in zip(photos, scene.frames, strict=True))
+    photos = synthesize.recorded_images(scene, SynthesizeConfig())
+    assert all(np.array_equal(~p.usable, read_label(scene, f, "rendered")) for p, f in zip(photos, scene.frames_in("train"), strict=True))
     config = fit_config(method="street_gaussians", iterations=4, start__gaussians=900, densify__max_gaussians=1500)
     again = fit.run(config, out / "scene", out / "fuse", tmp_path / "again", start=out / "fit" / "street_gaussians")
     assert "car" not in fit.load_model(again).node_names()

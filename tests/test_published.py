@@ -253,7 +253,7 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
     assert not torch.equal(model.sample(condition, SampleRequest(3, seed=5, index=2)).rgb, first.rgb)
 
 
-def test_depth_is_aligned_to_the_points_and_more_samples_only_change_the_confidence(model):
+def test_depth_is_aligned_to_the_points(model):
     condition = some_condition()
     plain = model.sample(condition, SampleRequest(2, align=False))
     aligned = model.sample(condition, SampleRequest(2))
@@ -262,9 +262,6 @@ def test_depth_is_aligned_to_the_points_and_more_samples_only_change_the_confide
     for before, after, fit in zip(plain.depth, aligned.depth, aligned.depth_fits):
         expected = (fit.scale * before + fit.shift_m).clamp(min=0.1) if fit.used else before
         assert torch.allclose(after, expected)
-    several = model.sample(condition, SampleRequest(2, n_samples=2))
-    assert torch.equal(several.rgb, aligned.rgb)
-    assert not torch.equal(several.confidence, aligned.confidence)
 
 
 def test_guidance_is_that_of_the_schedule_module(model):
@@ -497,8 +494,8 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     from mudg.data.scene import read_scene
 
     scene = read_scene(street / "scene")
-    recorded = synthesize.recorded_images(scene, SynthesizeConfig(held_out_images=True, given_classes=False))
-    view = scene.frames_of("front")[1].view
+    recorded = synthesize.recorded_images(scene, SynthesizeConfig(given_classes=False))
+    view = recorded[0].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]
     assert synthesize.recorded_at_pose(view, recorded)

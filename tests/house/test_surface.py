@@ -105,8 +105,8 @@ def test_a_function_shows_its_settings_and_defaults() -> None:
 
 def stub() -> str:
     """The signatures of all functions, for type checkers and editors."""
-    lines = ['"""Generated: `MUDG_UPDATE_FROZEN=1 pytest tests/house`."""', "", "from collections.abc import Mapping", "from pathlib import Path",
-             "from typing import Any, Literal"]  # fmt: skip
+    imports = "from collections.abc import Mapping\nfrom pathlib import Path\nfrom typing import Any, Literal"
+    lines = ['"""Generated: `MUDG_UPDATE_FROZEN=1 pytest tests/house`."""', "", imports]
     for name, verb in functions.VERBS.items():
         lines += ["", f"def {name}("]
         star = False

@@ -52,7 +52,7 @@ OWN: Final[Mapping[str, str]] = {
     **{f"synthesize.{name}": f"give --{name}" for name in ("model", "precision", "seed", "device", "processes")},
     **{f"fit.{name}": f"give --{name}" for name in ("iterations", "seed", "device")}, "fit.method": "give --methods",
     **dict.fromkeys((
-        "synthesize.cameras", "synthesize.shifts_m", "synthesize.paths", "synthesize.condition", "synthesize.held_out_images",
+        "synthesize.cameras", "synthesize.shifts_m", "synthesize.paths", "synthesize.condition",
         "score.baseline", "score.error_pictures", "score.perceptual_views",
     ), "leave it out"),
 }  # fmt: skip

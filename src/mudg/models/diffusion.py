@@ -50,7 +50,6 @@ class SampleRequest:
         eta: ddim: noise added between steps, 0 to 1 (None = the sampler's default).
         guidance: published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own).
         guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's own).
-        n_samples: if > 1, the first sample is returned, and the spread of all lowers the confidence.
         known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
         start: a clip at the size of the condition that the sample begins from, each pixel as far as its freedom says; small kind.
         align: bring each frame's depth to the measured scale (`core.align`).
@@ -64,7 +63,6 @@ class SampleRequest:
     eta: float | None = None
     guidance: float | None = None
     guidance_rescale: float | None = None
-    n_samples: int = 1
     known: Mapping[Modality, Tensor] | None = field(default=None, repr=False)
     start: StartClip | None = field(default=None, repr=False)
     align: bool = True

@@ -130,7 +130,7 @@ def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -
         threads=config.threads or native.default_threads(),
         frozen="denoiser" if config.trained == "refiner" else "nothing",
         data=LearnData(
-            width=learnt.width_px, height=learnt.height_px, window=config.block, clips=str(clips), augment=config.augment, cities=train,
+            width=learnt.width_px, height=learnt.height_px, window=config.block, clips=str(clips), cities=train,
             first_cities=train, clips_per_city=1, held_out=len(plan) - train, renders=False,  # the network is taken as it is
         ),
         optimizer=LearnOptimizer(

@@ -95,6 +95,8 @@ OUTPUT = VerbOutput(
 )  # fmt: skip
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
+EXPOSURE_WEIGHT = 0.01
+"""Weight that pulls the colour maps of recorded and virtual views towards the identity."""
 LEAST_WITNESSES, WITNESS_SHARE = 8, 0.015
 """Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a step)."""
 MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
@@ -497,8 +499,8 @@ def correction_terms(
     (once densification is over)."""
     terms: dict[str, Tensor] = {}
     distance = state.appearance.penalty(view.name, view.kind)
-    if distance is not None and config.appearance.exposure_weight:
-        terms["exposure"] = config.appearance.exposure_weight * distance
+    if distance is not None:
+        terms["exposure"] = EXPOSURE_WEIGHT * distance
     if config.loss.object_weight and view.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
         alpha = rasterize(objects_only(gaussians), view.view, raster).alpha
         inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)

@@ -43,6 +43,8 @@ _OUTPUT = VerbOutput("fuse", 2, ("static.safetensors", "objects/*.safetensors", 
 _TOP_VIEW_PX = (1400, 1000)
 MOST_NAMED = 3
 """Objects that are left out are named up to here, then counted."""
+MOST_IMAGE_GAP_S = 0.06
+"""A sweep's points are coloured only from images within this time."""
 MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
 """To match the cameras' colours: sweeps, images of each camera per sweep, and how far in time they may be."""
 
@@ -119,18 +121,18 @@ def rules_of(config: FuseConfig) -> FusionRules:
 
 def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
     """The sweeps of a scene, one at a time, each with the images that may colour it."""
-    frames = [f for f in scene.frames if config.color_from_held_out or scene.split.get(f.id, "train") == "train"]
+    frames = scene.frames_in("train")
     by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
         chosen = [_nearest(found, sweep.time_s) for found in by_camera.values() if found]
-        shots = [_photo(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= config.max_image_gap_s]
+        shots = [_photo(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= MOST_IMAGE_GAP_S]
         points = read_points(scene, sweep)
         yield SweepShots(sweep.time_s, sweep.world_from_lidar, points, shots)
 
 
 def camera_colors(scene: Scene, config: FuseConfig, rules: FusionRules) -> CameraColors:
     """How the colours of the scene's cameras differ, from static points of some sweeps in images of about the same time."""
-    frames = [f for f in scene.frames if config.color_from_held_out or scene.split.get(f.id, "train") == "train"]
+    frames = scene.frames_in("train")
     by_camera = {name: found for name in scene.cameras if (found := [f for f in frames if f.view.camera.name == name])}
     if len(by_camera) < 2 or not scene.sweeps:
         return SAME_COLORS

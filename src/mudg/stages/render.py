@@ -202,7 +202,7 @@ def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str
     if config.remove_tracks:
         fitted = fitted.without_nodes(config.remove_tracks)
     source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
-    return lambda view: render_view(fitted, view, raster, config.sky_below_alpha, source), source
+    return lambda view: render_view(fitted, view, raster, source), source
 
 
 def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tuple[Drawer, str]:
@@ -210,7 +210,7 @@ def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tu
     field, budget = load_field(model)
     source = str(field.facts.get("method", "fit"))
     return functools.partial(
-        observe, field.to(device), budget=budget, sky_below_alpha=config.sky_below_alpha, source=source
+        observe, field.to(device), budget=budget, source=source
     ), source
 
 

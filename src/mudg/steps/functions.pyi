@@ -23,8 +23,6 @@ def adapt(
     batch_frames: int = 16,
     lr: float = 0.0001,
     trained: Literal['all', 'refiner'] = 'all',
-    augment: bool = True,
-    label_confidence: float = 0.5,
     precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
     device: str = 'auto',
     processes: int = 0,
@@ -51,8 +49,6 @@ def adapt(
         batch_frames: Frames per training step.
         lr: Largest learning rate.
         trained: Parts that are trained. refiner: refiner and finisher only.
-        augment: Vary the training clips in colour, and mirror them.
-        label_confidence: Labels of recorded images with a confidence below this, 0 to 1, are not given to the model.
         precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere.
         device: Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         processes: Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion model is not on the CPU). The result does not depend on it.
@@ -438,9 +434,7 @@ def fuse(
     config: str | Path | None = None,
     voxel_m: float = 0.0,
     occlusion_test: bool = True,
-    max_image_gap_s: float = 0.06,
     match_colors: bool = True,
-    color_from_held_out: bool = False,
     box_growth_m: float = 0.1,
     floor_margin_m: float = 0.1,
     moving_distance_m: float = 0.5,
@@ -458,9 +452,7 @@ def fuse(
         config: YAML file of settings, read before those given here.
         voxel_m: Keep one point per voxel of this size, in metres (0 = keep all).
         occlusion_test: Do not colour points that lie behind a nearer surface.
-        max_image_gap_s: A sweep's points are coloured only from images within this time, in seconds.
         match_colors: Find how exposure and white balance differ between cameras, from points that several of them saw, and correct it in clouds, fits and generated views. A camera's own views keep its colours.
-        color_from_held_out: Also take colours from held-out images. Scores at held-out frames are then not meaningful.
         box_growth_m: Boxes of dynamic objects are enlarged by this distance on each side, in metres. Raise it if objects leave points behind.
         floor_margin_m: Points up to this height, in metres, above the bottom of a dynamic object's box stay with the road.
         moving_distance_m: A tracked box is dynamic if its displacement or its path is longer than this, in metres.
@@ -638,7 +630,6 @@ def render(
     yaw_deg: float = 0.0,
     width_px: int = 0,
     remove_tracks: tuple[str, ...] = (),
-    sky_below_alpha: float = 0.5,
     video: bool = True,
     fps: float = 10.0,
     harmonize: Mapping[str, Any] = ...,
@@ -662,7 +653,6 @@ def render(
         yaw_deg: Yaw in degrees, counter-clockwise seen from above; applies to every shift.
         width_px: Image width in pixels (0 = as recorded); the height follows.
         remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
-        sky_below_alpha: Pixels whose opacity is below this, 0 to 1, become sky: class sky, no depth.
         video: Also write one MP4 video per trajectory.
         fps: Frames per second of the videos.
         harmonize: With an edit script: let the diffusion model repair what the edits touch.
@@ -810,7 +800,6 @@ def synthesize(
     steps: int = 2,
     sampler: Literal['ddim', 'dpm_solver'] = 'ddim',
     eta: float | None = None,
-    samples: int = 1,
     condition: Literal['full', 'reference', 'points', 'concat', 'freevs', 'repair'] = 'full',
     given_classes: bool = True,
     label_confidence: float = 0.5,
@@ -818,7 +807,6 @@ def synthesize(
     overlap: int = 2,
     width_px: int = 0,
     full_size: bool = True,
-    held_out_images: bool = False,
     precision: Literal['auto', 'float32', 'bfloat16', 'float16'] = 'auto',
     device: str = 'auto',
     processes: int = 0,
@@ -846,7 +834,6 @@ def synthesize(
         steps: Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type models.
         sampler: Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and deterministic, for many steps. Both cost one network pass per step.
         eta: Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
-        samples: Samples per clip. The first one is kept; the spread of all of them lowers the confidence. Time grows with this number.
         condition: Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. freevs: the condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair: renders of `--fitted` and the nearest recorded image, without points; gives colour alone.
         given_classes: Use the classes of labelled points and recorded images in the model's condition, if the scene has labels.
         label_confidence: Labels of recorded images with a confidence below this, 0 to 1, are not used.
@@ -854,7 +841,6 @@ def synthesize(
         overlap: Frames that a window of the model shares with the previous window; they are kept, so that the video continues smoothly. Published-type models: 8.
         width_px: Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect ratio).
         full_size: Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from warped recorded images. Off: at the size the model works at.
-        held_out_images: Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful.
         precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as in the release.
         device: Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
         processes: Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models, and where the diffusion model is not on the CPU).

@@ -450,15 +450,8 @@ class MDM(nn.Module):
         """
         self.check_request(request)
         encoded = self.encode_condition(condition)
-        drawn: list[dict[Modality, Tensor]] = []
-        change, log_error = torch.zeros_like(encoded.seen["rgb"]), None
-        for number in range(request.n_samples):
-            latents, moved = self._denoise(encoded, request, number)
-            change = torch.maximum(change, moved)
-            drawn.append(latents)
-        if request.n_samples > 1:
-            change = torch.stack([d["rgb"] for d in drawn]).std(0).mean(2, keepdim=True) * 2
-        latents = {m: z[0] for m, z in drawn[0].items()}
+        drawn, change = self._denoise(encoded, request)
+        latents, log_error = {m: z[0] for m, z in drawn.items()}, None
         with torch.autocast(self.device.type, torch.bfloat16, enabled=request.bf16):
             if self.refiner is None:
                 decoded = self.codec.decode(latents)
@@ -469,8 +462,6 @@ class MDM(nn.Module):
                 made = self._made(self.refine(latents, pixels, len(condition.views)))
                 decoded, log_error = self._decoded(made), made.log_error
                 confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
-                if request.n_samples > 1:
-                    confidence = confidence * functional.interpolate(torch.exp(-2.0 * change[0]), size=confidence.shape[-2:])
         depth, fits = decoded.depth, []
         if request.align:
             depth, fits = align_depth(depth, condition.depth, condition.valid)
@@ -504,11 +495,11 @@ class MDM(nn.Module):
         """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its colour over."""
         return Decoded(made.rgb.add_(1).div_(2).clamp_(0, 1), code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
 
-    def _denoise(self, encoded: ConditionLatents, request: SampleRequest, number: int) -> tuple[dict[Modality, Tensor], Tensor]:
-        """Draw sample `number` of a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
+    def _denoise(self, encoded: ConditionLatents, request: SampleRequest) -> tuple[dict[Modality, Tensor], Tensor]:
+        """Draw a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
         lead, cell = encoded.planes.shape[:2], encoded.planes.shape[-2:]
         sizes = [self.codec.channels[m] for m in MODALITIES]
-        generator = torch.Generator().manual_seed(seeds.key(request.seed, request.index * 64 + number, "sample"))
+        generator = torch.Generator().manual_seed(seeds.key(request.seed, request.index * 64, "sample"))
         device, shared = encoded.planes.device, self.config.shared_noise
         draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)  # noqa: E731
         known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)

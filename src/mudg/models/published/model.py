@@ -477,20 +477,14 @@ class PublishedMDM(nn.Module):
             encoded = self.encode_condition(condition, seeds.torch_generator(request.seed, request.index, "posterior"), before)
             tokens = self.image_tokens(torch.cat([encoded.features, encoded.grey]).to(self.image_tokens.queries.dtype))
             groups = [MODALITIES] if self.split.modalities_together else [(m,) for m in MODALITIES]
-            drawn: list[dict[Modality, Tensor]] = []
+            latents: dict[Modality, Tensor] = {}
             changes: list[Tensor] = []
-            for number in range(request.n_samples):
-                latents: dict[Modality, Tensor] = {}
-                for names in groups:
-                    part, moved = self._denoise(encoded, names, tokens, request, number)
-                    latents |= part
-                    changes.append(moved)
-                drawn.append(latents)
-            latents, change = drawn[0], changes[0]
-            if request.n_samples > 1:
-                change = torch.stack([d["rgb"] for d in drawn]).std(0).mean(1, keepdim=True) * 2
+            for names in groups:
+                part, moved = self._denoise(encoded, names, tokens, request)
+                latents |= part
+                changes.append(moved)
             decoded = self.codec.decode(latents, frames_at_once)
-        confidence = confidence_of(encoded.seen[0], change, self.codec.factor)
+        confidence = confidence_of(encoded.seen[0], changes[0], self.codec.factor)
         depth, fits = decoded.depth, list[DepthFit]()
         if request.align:
             points = condition.measurement
@@ -499,16 +493,16 @@ class PublishedMDM(nn.Module):
         return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits))
 
     def _denoise(
-        self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest, number: int
+        self, encoded: PublishedLatents, names: tuple[Modality, ...], tokens: Tensor, request: SampleRequest
     ) -> tuple[dict[Modality, Tensor], Tensor]:
-        """Draw sample `number` of some modalities in one batch; returns their latents [T,4,h,w] and how much the first's still
+        """Draw some modalities in one batch; returns their latents [T,4,h,w] and how much the first's still
         changed [T,1,h,w].
 
         `tokens` [2,T,16,D]: with the reference and without. Every modality has its own stream of noise.
         """
         _, frames, _, h, w = encoded.planes.shape
         shape = (1, frames, self.config.codec.latent_channels, h, w)
-        streams = [seeds.torch_generator(request.seed, request.index * 64 + number, f"sample {m}") for m in names]
+        streams = [seeds.torch_generator(request.seed, request.index * 64, f"sample {m}") for m in names]
         draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)  # noqa: E731
         velocity = self._guided(encoded, names, tokens, request)
         ends = {"last": "first_alpha"} if request.sampler == "ddim" else {}

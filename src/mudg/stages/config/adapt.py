@@ -17,7 +17,9 @@ class AdaptConfig:
     """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from where other
     photographs of the log were taken or might have been taken."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"cameras_left_out": ("block", [])}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "cameras_left_out": ("block", []), "augment": ("precision", True), "label_confidence": ("precision", 0.5),
+    }  # fmt: skip
 
     model: str = "embedded"
     """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must use renders."""
@@ -41,10 +43,6 @@ class AdaptConfig:
     """Largest learning rate."""
     trained: Literal["all", "refiner"] = "all"
     """Parts that are trained. refiner: refiner and finisher only."""
-    augment: bool = True
-    """Vary the training clips in colour, and mirror them."""
-    label_confidence: float = Field(default=0.5, ge=0, le=1)
-    """Labels of recorded images with a confidence below this, 0 to 1, are not given to the model."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
     device: DeviceName = "auto"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -85,10 +86,10 @@ class PoseConfig:
 class AppearanceConfig:
     """Correction of camera poses and exposure while fitting; renders do not use it."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"exposure_weight": ("cameras", 0.01)}
+
     exposure: Literal["none", "camera", "image"] = "none"
     """Learn an affine colour map per camera or per recorded image. Use it if exposure or white balance changes during the log."""
-    exposure_weight: float = Field(default=0.01, ge=0)
-    """Weight that pulls the colour maps of recorded and virtual views towards the identity."""
     cameras: bool = False
     """Correct the camera pose of every recorded image. Use it if calibration or vehicle poses are inaccurate."""
     virtual: bool = False

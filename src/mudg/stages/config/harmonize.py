@@ -15,7 +15,9 @@ from mudg.base.config import STRICT
 class HarmonizeConfig:
     """Where and how far a diffusion model changes the views of an edited scene."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weather_any_model": ("changed_above", False)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "weather_any_model": ("changed_above", False), "images_per_view": ("keep_classes", 24),
+    }  # fmt: skip
 
     on: bool = False
     """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
@@ -36,8 +38,6 @@ class HarmonizeConfig:
     """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as they are."""
     feather_px: int = Field(default=3, ge=0)
     """Generated pixels fade into the render over this many pixels, inside of what the edit touches."""
-    images_per_view: int = Field(default=24, ge=1)
-    """Recorded images tried per view. Many: what an object hid at one moment others show."""
     keep_classes: bool = True
     """Keep the render where the model shows another object in place of a removed one, or none in place of one that is there."""
     seed: int = 0

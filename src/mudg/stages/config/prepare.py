@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -87,17 +88,17 @@ class AnnotateConfig:
 class FuseConfig:
     """Fuse sweeps and images into a static coloured point cloud and one cloud per dynamic object."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "max_image_gap_s": ("match_colors", 0.06), "color_from_held_out": ("box_growth_m", False),
+    }  # fmt: skip
+
     voxel_m: float = Field(default=0.0, ge=0)
     """Keep one point per voxel of this size, in metres (0 = keep all)."""
     occlusion_test: bool = True
     """Do not colour points that lie behind a nearer surface."""
-    max_image_gap_s: float = Field(default=0.06, ge=0)
-    """A sweep's points are coloured only from images within this time, in seconds."""
     match_colors: bool = True
     """Find how exposure and white balance differ between cameras, from points that several of them saw, and correct it in clouds, fits and
     generated views. A camera's own views keep its colours."""
-    color_from_held_out: bool = False
-    """Also take colours from held-out images. Scores at held-out frames are then not meaningful."""
     box_growth_m: float = Field(default=0.1, ge=0, le=2)
     """Boxes of dynamic objects are enlarged by this distance on each side, in metres. Raise it if objects leave points behind."""
     floor_margin_m: float = Field(default=0.1, ge=0, le=1)

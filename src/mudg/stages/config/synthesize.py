@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -14,6 +15,8 @@ from mudg.base.devices import DeviceName
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"samples": ("condition", 1), "held_out_images": ("precision", False)}
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
@@ -32,8 +35,6 @@ class SynthesizeConfig:
     eta: float | None = Field(default=None, ge=0, le=1)
     """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
-    samples: int = Field(default=1, ge=1)
-    """Samples per clip. The first one is kept; the spread of all of them lowers the confidence. Time grows with this number."""
     condition: Literal["full", "reference", "points", "concat", "freevs", "repair"] = "full"
     """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points:
     LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image
@@ -54,8 +55,6 @@ class SynthesizeConfig:
     full_size: bool = True
     """Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from warped recorded
     images. Off: at the size the model works at."""
-    held_out_images: bool = False
-    """Also warp recorded images that are held out for scoring. Scores at those frames are then not meaningful."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere
     (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as in the release."""

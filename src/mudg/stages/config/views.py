@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -15,6 +16,8 @@ from mudg.stages.config.harmonize import HarmonizeConfig
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"sky_below_alpha": ("video", 0.5)}
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras to render (empty = the first camera). A name that the scene lacks is an error."""
@@ -31,8 +34,6 @@ class RenderConfig:
     """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
     """Ids of tracked objects to leave out, as listed in the scene."""
-    sky_below_alpha: float = Field(default=0.5, ge=0, le=1)
-    """Pixels whose opacity is below this, 0 to 1, become sky: class sky, no depth."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
     fps: float = Field(default=10.0, gt=0)

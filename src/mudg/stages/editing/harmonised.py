@@ -52,7 +52,7 @@ from mudg.stages.editing.written import EditedImages
 from mudg.stages.fitting.planes import FAR_M, render_planes
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.learning import loading
-from mudg.stages.synthesize import ViewMaker, recorded_images, windows
+from mudg.stages.synthesize import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_images, windows
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
 GROWN_PX: Final = 2
@@ -214,7 +214,7 @@ class Harmoniser:
         self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
         self._overlap = min(overlap, self.window - 1)
         width, height = model.image_size(*size, 0)
-        rules = ConditionRules(width, height, *size, images_per_view=config.images_per_view, published=model.points_alone)
+        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone)
         given = ConditionSources(
             sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
             vacated_at(sources.plan),

@@ -28,7 +28,7 @@ from mudg.stages.editing.harmonised import PUBLISHED_OVERLAP, DrawPair, EditedSo
 from mudg.stages.editing.vacated import vacated_at
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.learning import loading
-from mudg.stages.synthesize import recorded_at_pose, windows
+from mudg.stages.synthesize import EDITED_IMAGES_PER_VIEW, recorded_at_pose, windows
 
 
 def harmonises_weather(config: HarmonizeConfig, how: InWeather) -> bool:
@@ -59,7 +59,7 @@ class WeatherHarmoniser:
         self._model = loading.load_any(settings)
         self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
         width, height = self._model.image_size(*size, 0)
-        rules = ConditionRules(width, height, *size, images_per_view=config.images_per_view, published=True)
+        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
         self._given = ConditionSources(
             sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
             vacated_at(sources.plan), how,

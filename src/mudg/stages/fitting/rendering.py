@@ -73,22 +73,25 @@ def check_drawing(config: FitConfig, device: torch.device) -> None:
         raise UsageError("unscented projection has no gradients of camera poses", where="--appearance.cameras",
                          remedy="leave it out, or set --drawing.projection linear")  # fmt: skip
 
+COVERED = 0.5
+"""Opacity from which on a pixel is no sky."""
+
 
 @torch.no_grad()
 def render_view(
-    model: SceneModel, view: View, raster: RasterConfig, sky_below_alpha: float = 0.5, source: str = ""
+    model: SceneModel, view: View, raster: RasterConfig, source: str = ""
 ) -> Observation:
     """Render one view of a fitted scene as an observation of kind "virtual", on the CPU.
 
-    Where coverage is below ``sky_below_alpha``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
+    Where coverage is below ``COVERED``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
     sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
     """
-    return _brought_back(_observed(model, rasterize(compose(model, view.time_s), view, raster), view, sky_below_alpha, source))
+    return _brought_back(_observed(model, rasterize(compose(model, view.time_s), view, raster), view, source))
 
 
 @torch.no_grad()
 def render_condition(
-    model: SceneModel, view: View, raster: RasterConfig | None = None, sky_below_alpha: float = 0.5
+    model: SceneModel, view: View, raster: RasterConfig | None = None
 ) -> RenderedCondition:
     """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``."""
     gaussians, certainty = compose(model, view.time_s), model.certainty
@@ -102,7 +105,7 @@ def render_condition(
     if certainty is not None and render.extra is not None:
         blended = torch.minimum(render.extra[-1].clamp_min(0), render.alpha[0])
         render = replace(render, extra=render.extra[:-1] if len(render.extra) > 1 else None)
-    seen = _observed(model, render, view, sky_below_alpha)
+    seen = _observed(model, render, view)
     shape = render.alpha.shape[1:]
     depth = render.alpha.new_full(shape, torch.nan) if seen.depth is None else seen.depth[0]
     unknown = render.alpha.new_full(shape, palette.UNLABELLED, dtype=torch.uint8)
@@ -119,9 +122,9 @@ def _brought_back(result: Rendered) -> Rendered:
     return replace(made, **{name: value.cpu() for name, value in tensors.items()})
 
 
-def _observed(model: SceneModel, render: Render, view: View, sky_below_alpha: float, source: str = "") -> Observation:
+def _observed(model: SceneModel, render: Render, view: View, source: str = "") -> Observation:
     rgb = composite_sky(model, view, render.rgb, render.alpha).clamp(0, 1)
-    covered = render.alpha >= sky_below_alpha
+    covered = render.alpha >= COVERED
     depth = torch.where(covered, render.depth, torch.nan)
     semantics = None
     if render.extra is not None:

@@ -77,7 +77,7 @@ def request_of(config: SynthesizeConfig, bf16: bool = False) -> SampleRequest:
     """What a configuration asks of the model for every window; the window's own number and known frames are to be put in."""
     return SampleRequest(
         config.steps, config.seed, sampler=config.sampler, eta=config.eta, guidance=config.guidance,
-        guidance_rescale=config.guidance_rescale, n_samples=config.samples, align=config.align_depth, bf16=bf16,
+        guidance_rescale=config.guidance_rescale, align=config.align_depth, bf16=bf16,
     )  # fmt: skip
 
 

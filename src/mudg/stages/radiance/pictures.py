@@ -15,6 +15,7 @@ from mudg.base.types import Observation, View
 from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
 from mudg.models.radiance.field import RadianceField
 from mudg.models.radiance.march import Budget, Rays, colors, march
+from mudg.stages.fitting.rendering import COVERED
 from mudg.stages.fitting.views import StoredView
 from mudg.stages.radiance.rays import view_rays
 
@@ -59,11 +60,11 @@ def _part(field: RadianceField, rays: Rays, budget: Budget) -> Tensor:
 
 
 def observe(
-    field: RadianceField, view: View, budget: Budget, sky_below_alpha: float = 0.5, source: str = ""
+    field: RadianceField, view: View, budget: Budget, source: str = ""
 ) -> Observation:
-    """One view as an observation of kind "virtual", without classes; where opacity is below ``sky_below_alpha`` there is no depth."""
+    """One view as an observation of kind "virtual", without classes; where opacity is below ``COVERED`` there is no depth."""
     seen = see(field, view, budget)
-    covered = seen.opacity[None] >= sky_below_alpha
+    covered = seen.opacity[None] >= COVERED
     opacity = seen.opacity[None].clamp(0, 1)
     depth = torch.where(covered, seen.depth[None], torch.nan)
     mask = torch.ones_like(covered)
