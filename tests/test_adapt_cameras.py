@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 
 from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
 from mudg.base.errors import InputError
@@ -24,7 +25,7 @@ from mudg.stages import adapt, fit, fuse, ingest
 from mudg.stages.adapting import cameras as adapt_cameras
 from mudg.stages.adapting import clips as adapt_clips
 from mudg.stages.adapting import lessons as adapt_lessons
-from mudg.stages.config import AdaptConfig, FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config import AdaptConfig, FuseConfig, IngestConfig
 from mudg.stages.fitting.storage import load_model
 
 CAMERA = Camera("front", 16, 12, 8.0, 8.0, 8.0, 6.0)
@@ -34,10 +35,10 @@ CAMERA = Camera("front", 16, 12, 8.0, 8.0, 8.0, 6.0)
 def log(tmp_path_factory):
     """A small drive of two cameras, its cloud, a fit to it, and a tiny model that uses renders."""
     root = tmp_path_factory.mktemp("cameras")
-    city = CityConfig(seed=5, n_frames=8, width=96, height=64, cameras=("front", "front_left"))
+    city = CityConfig(seed=5, n_frames=8, width=96, height=64, cameras=("front", "front_left"), lidar_azimuth_step_deg=0.6)
     ingest.run(IngestConfig(city=city, test_every=0), ingest.CITY, root / "scene")
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
-    fit.run(FitConfig(method="street_gaussians", iterations=30), root / "scene", root / "fuse", root / "fit")
+    fit.run(fit_config(method="street_gaussians", iterations=30, start__gaussians=8000), root / "scene", root / "fuse", root / "fit")
     before = files.load("embedded-tiny")
     files.save(extended(before, replace(before.config, renders=True)), root / "tiny", "", {})
     return root
