@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import SMALL_RADIANCE, fit_config
 from pretend_device import pretend_device
 from toy_world import fused_cloud, view_at, write_scene
 
@@ -34,10 +34,7 @@ from mudg.stages.radiance.storage import load_field
 
 TINY = {
     "method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4,
-    "radiance__rays": 48, "radiance__lidar_rays": 24, "radiance__proposal_samples": (16, 12), "radiance__samples": 8,
-    "radiance__static_grid": (3, 2, 4, 16, 10), "radiance__dynamic_grid": (3, 2, 4, 16, 10), "radiance__flow_grid": (2, 2, 4, 8, 9),
-    "radiance__first_proposal_grid": (2, 1, 4, 8, 9), "radiance__second_proposal_grid": (2, 1, 4, 16, 9),
-    "radiance__width": 8, "radiance__proposal_width": 8, "radiance__appearance": 4,
+    **SMALL_RADIANCE,
 }  # fmt: skip
 FEW_RAYS = {"radiance__rays": 8, "radiance__lidar_rays": 8, "radiance__proposal_samples": (6, 4), "radiance__samples": 4}
 
