@@ -322,6 +322,7 @@ def with_effects(run: Path) -> str:
     return str(folder)
 
 
+@pytest.mark.slow
 def test_weather_is_corrected_by_a_model_that_takes_an_effect_vector(run: Path, tmp_path: Path, capsys) -> None:
     log.set_quiet(False)  # a command before may have been asked to be
     edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"

@@ -256,8 +256,8 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
 
 
 def test_a_short_fit_lowers_its_losses(world):
-    state, config = started(world, iterations=50, radiance__rays=96, radiance__lidar_rays=96, radiance__samples=12)
-    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 51)]
+    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
+    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 81)]
     for name in ("color", "lidar"):
         assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
 
