@@ -19,7 +19,7 @@ os.environ.setdefault("NO_COLOR", "1")
 os.environ.setdefault("COLUMNS", "120")
 
 settings.register_profile(
-    "mudg", deadline=None, derandomize=True, max_examples=50, database=None,
+    "mudg", deadline=None, derandomize=True, max_examples=25, database=None,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 settings.load_profile("mudg")

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fit_settings import fit_config
 from pretend_device import pretend_device
 
 from mudg.base import palette, store
@@ -21,7 +22,7 @@ from mudg.models.mdm.extended import extended
 from mudg.stages import adapt, fit, fuse, ingest
 from mudg.stages.adapting import clips as adapt_clips
 from mudg.stages.adapting import lessons as adapt_lessons
-from mudg.stages.config import AdaptConfig, FitConfig, FuseConfig, IngestConfig
+from mudg.stages.config import AdaptConfig, FuseConfig, IngestConfig
 from mudg.stages.fitting.storage import load_model
 
 SIZE = (96, 64)
@@ -31,10 +32,10 @@ SIZE = (96, 64)
 def log(tmp_path_factory):
     """A small drive, its cloud, a fit to it, and a tiny model that uses renders."""
     root = tmp_path_factory.mktemp("adapt")
-    city = CityConfig(seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",))
+    city = CityConfig(seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",), lidar_azimuth_step_deg=0.6)
     ingest.run(IngestConfig(city=city, test_every=6), ingest.CITY, root / "scene")
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
-    fit.run(FitConfig(method="street_gaussians", iterations=30), root / "scene", root / "fuse", root / "fit")
+    fit.run(fit_config(method="street_gaussians", iterations=30, start__gaussians=8000), root / "scene", root / "fuse", root / "fit")
     before = files.load("embedded-tiny")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
     files.save(extended(before, grown), root / "tiny", "", {})
@@ -200,7 +201,8 @@ def test_what_cannot_be_adapted_is_refused(log, tmp_path):
         adapted(log, tmp_path / "b", block=20)
     assert not (tmp_path / "b").exists()
     other = tmp_path / "other"
-    ingest.run(IngestConfig(city=CityConfig(seed=6, n_frames=13, width=96, height=64, cameras=("front",))), ingest.CITY, other)
+    city = CityConfig(seed=6, n_frames=2, width=48, height=32, cameras=("front",), lidar_beams=4)
+    ingest.run(IngestConfig(city=city, contact_sheet=False), ingest.CITY, other)
     with pytest.raises(InputError, match="another log"):
         adapt.run(settings(log), other, log / "fuse", log / "fit", tmp_path / "d")
     with pytest.raises(InputError, match="camera"):

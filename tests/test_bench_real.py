@@ -175,7 +175,8 @@ def untouched(city, model, tmp_path_factory):
     return {name: made_from(city, tmp_path_factory.mktemp(name), SPLITS[name], model) for name in ("gap-3", "camera")}
 
 
-@pytest.mark.parametrize("split", ["gap-3", pytest.param("camera", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("split", ["gap-3", "camera"])
 def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(city, model, tmp_path, split, untouched):
     scene, plain, split = read_scene(city), untouched[split], SPLITS[split]
     held = places.held_out(scene, split, ())
@@ -363,6 +364,7 @@ def test_exact_views_are_right_on_held_out_frames(exact):
     assert targets.facts["views"] == {"front": 3, "front_left": 3}
 
 
+@pytest.mark.slow
 def test_exact_views_are_right_for_a_camera_that_was_never_shown(exact):
     found, targets = exact("camera")
     assert list(targets.facts["views"]) == ["front_left"] and targets.facts["views"]["front_left"] == 3
@@ -374,6 +376,7 @@ def test_exact_views_are_right_for_a_camera_that_was_never_shown(exact):
     assert targets.color_maps["front_left"].gain == pytest.approx((1, 1, 1), abs=0.12)
 
 
+@pytest.mark.slow
 def test_exact_views_are_right_beside_the_recorded_path(exact):
     found, targets = exact("lidar")
     assert targets.facts["views"] == {"2 m": 12, "3 m": 12}
@@ -391,6 +394,7 @@ def made(city, tmp_path_factory):
     return real.run(config, [city], out), config
 
 
+@pytest.mark.slow
 def test_the_command_compares_methods_under_every_protocol(made, city):
     out, _ = made
     document = store.read_json(out / "bench.json")
@@ -414,6 +418,7 @@ def test_the_command_compares_methods_under_every_protocol(made, city):
     assert page.count("data:image/jpeg;base64,") == 3 * (2 + 2 + 1 + 2) and 'src="city' not in page
 
 
+@pytest.mark.slow
 def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     out, config = made
     split = out / "city" / "gap-1"
@@ -440,6 +445,7 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     assert shown == {"points": None, "renders": start}
 
 
+@pytest.mark.slow
 def test_a_log_too_short_to_adapt_to_is_compared_without_and_says_so(made, city):
     out, _ = made  # with the methods added above
     document = store.read_json(out / "bench.json")
@@ -507,6 +513,7 @@ def pandaset(city, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_methods(pandaset, tmp_path):
     config = BenchConfig(methods=("nearest_fill",), protocols=("classes",), resolution="48", frames="0:3", processes=1)
     out = real.run(config, [pandaset], tmp_path / "out")

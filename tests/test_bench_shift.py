@@ -181,6 +181,7 @@ def made(tmp_path_factory):
     return shift.run(config, out, rules=TINY, distances_m=(3.0,)), config
 
 
+@pytest.mark.slow
 def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made, tmp_path):
     truth = made[0] / str(city_logs.DEVELOPMENT[0]) / "truth"
     names = sorted(path.name for path in truth.iterdir() if path.is_dir())
@@ -193,6 +194,7 @@ def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made,
     assert torch.equal(seen.rgb, true.rgb) and torch.equal(seen.semantics, true.semantics)
 
 
+@pytest.mark.slow
 def test_the_command_compares_methods_and_reuses_what_is_there(made):
     out, config = made
     document = store.read_json(out / "bench.json")
@@ -238,6 +240,7 @@ def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp
     assert "generated with renders of the fit on recorded views" in (out / "bench.md").read_text()
 
 
+@pytest.mark.slow
 def test_stored_truth_is_the_drawn_truth(made):
     out, _ = made
     log = out / str(city_logs.DEVELOPMENT[0])
@@ -255,6 +258,7 @@ def test_stored_truth_is_the_drawn_truth(made):
         stored.at_view(view, None, "front_shift+9.0")
 
 
+@pytest.mark.slow
 def test_other_settings_in_the_same_folder_are_refused(made):
     out, config = made
     with pytest.raises(UsageError, match="another configuration"):

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(native.library() is None, reason="the native lib
 RULES = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True)
 
 
-@pytest.mark.parametrize("realism", ["plain", "varied"])
+@pytest.mark.parametrize("realism", [pytest.param("plain", marks=pytest.mark.slow), "varied"])
 def test_the_scene_of_a_log_holds_what_its_clips_may_know(tmp_path, realism):
     rules = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True, realism=realism)
     log = from_city.make_log(rules, 3, 5)

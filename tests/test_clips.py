@@ -269,9 +269,9 @@ def test_city_clips_are_a_function_of_seed_and_number():
 
     if native.library() is None:
         pytest.skip("the native library is not built")
-    rules = CityClipRules(width=48, height=32, window=2, clips=2)
+    rules = CityClipRules(width=48, height=32, window=1, clips=1)
     first, again, other = (from_city.make_clips(rules, city) for city in (5, 5, 6))
-    assert [clip.shift_m for clip in first] == list(from_city.shifts_of(rules, 5)) and len(first) == 2
+    assert [clip.shift_m for clip in first] == list(from_city.shifts_of(rules, 5)) and len(first) == 1
     for name in ("rgb", "depth", "semantics"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name)), name
     assert torch.equal(first[0].condition.color, again[0].condition.color)

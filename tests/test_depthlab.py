@@ -411,6 +411,7 @@ def test_what_the_reference_unet_hands_over_matters(converted: Path) -> None:
     assert float((model.predict(inputs, noise) - model.predict(mirrored, noise)).abs().mean()) > 1e-4
 
 
+@pytest.mark.slow
 def test_known_cells_follow_the_known_depth_until_the_last_step(converted: Path) -> None:
     model = DepthLab.load(converted)
     parts = model._parts
@@ -432,6 +433,7 @@ def test_known_cells_follow_the_known_depth_until_the_last_step(converted: Path)
     assert torch.equal(calls[0][0][:, 4:], calls[-1][0][:, 4:])  # mask and known depth stay
 
 
+@pytest.mark.slow
 def test_all_steps_start_from_noise(converted: Path, tmp_path: Path) -> None:
     shutil.copytree(converted, tmp_path / "copy")
     whole = {"processing_px": 32, "steps": 3, "strength": 1, "normalize_scale": 1}
@@ -459,6 +461,7 @@ def test_answers_are_of_the_images_size_and_always_the_same(converted: Path) -> 
     np.testing.assert_allclose(model(other).values, 2 * first.values, rtol=1e-3, atol=1e-3)  # metres in, metres out
 
 
+@pytest.mark.slow
 def test_bfloat16_gives_nearly_the_same(converted: Path) -> None:
     given, _ = street(24, 32)
     options = DepthOptions(steps=3)

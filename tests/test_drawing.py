@@ -30,7 +30,7 @@ SMOOTH = replace(USUAL, drawing=DrawingConfig(antialias=True))
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A scene of three frames and its clouds."""
     root = tmp_path_factory.mktemp("drawing")
-    city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",))
+    city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",), lidar_azimuth_step_deg=1.0)
     scene = ingest.run(IngestConfig(city=city, contact_sheet=False, test_every=0), "city", root / "scene")
     return scene, fuse.run(FuseConfig(), scene, root / "fuse")
 

@@ -106,10 +106,10 @@ def test_the_moving_car_is_where_its_track_says(learnt):
 
 
 def test_same_in_same_out(world, tmp_path):
-    first = fit.run(settings(), world["scene"], world["fuse"], tmp_path / "a")
-    second = fit.run(settings(), world["scene"], world["fuse"], tmp_path / "b")
+    first = fit.run(settings(iterations=12), world["scene"], world["fuse"], tmp_path / "a")
+    second = fit.run(settings(iterations=12), world["scene"], world["fuse"], tmp_path / "b")
     assert fitted_bytes(first) == fitted_bytes(second)
-    other = fit.run(settings(seed=1), world["scene"], world["fuse"], tmp_path / "c")
+    other = fit.run(settings(iterations=12, seed=1), world["scene"], world["fuse"], tmp_path / "c")
     assert fitted_bytes(other) != fitted_bytes(first)
 
 
@@ -378,16 +378,16 @@ def test_fused_points_give_depth_beside_the_path(world):
     assert car.sum() > 5 and relative[car].median() < 0.05
 
 
-@pytest.mark.parametrize("changes", [{"lidar_weight": 0.0}, {"ssim_weight": 0.0}, {"densify": True}])
-def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path, changes):
-    usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
+def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path):
+    usual = settings("mudg_s", iterations=14, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [
-        fit.run(config, world["scene"], world["fuse"], tmp_path / name, observations=world["virtual"])
-        for name, config in (("usual", usual), ("changed", replace(usual, virtual=replace(usual.virtual, **changes))))
-    ]
-    assert fitted_bytes(folders[0]) != fitted_bytes(folders[1])
-    model = fit.load_model(folders[1])
-    assert all(torch.isfinite(value).all() for value in model.table.columns.values())
+        fit.run(replace(usual, virtual=replace(usual.virtual, **changes)), world["scene"], world["fuse"], tmp_path / str(n),
+                observations=world["virtual"])
+        for n, changes in enumerate(({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0}, {"densify": True}))
+    ]  # fmt: skip
+    assert len({fitted_bytes(folder)["gaussians.safetensors"] for folder in folders}) == len(folders)
+    for folder in folders:
+        assert all(torch.isfinite(value).all() for value in fit.load_model(folder).table.columns.values())
 
 
 def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world, tmp_path, monkeypatch):

@@ -426,6 +426,7 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
     assert torch.allclose(made.color[0][:, colored], expected[:, ::4, ::4][:, colored], atol=0.015)
 
 
+@pytest.mark.slow
 def test_weather_is_generated_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch, capsys) -> None:
     """Its points and its reference are in the fog; beside the recorded path the first frame, which is the reference, stays as rendered."""
     log.set_quiet(False)
@@ -453,6 +454,7 @@ def test_weather_is_generated_by_a_published_type_model(run: Path, published: st
     assert float(given[0].color[0][:, seen].std()) < 0.5 * float(clear.color[0][:, seen].std())
 
 
+@pytest.mark.slow
 def test_views_are_generated_in_weather_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch) -> None:
     edits, folders, fitted = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse"), run / "fit" / "street_gaussians"
     config = SynthesizeConfig(shifts_m=(1.0,), model=published, steps=1, precision="float32")

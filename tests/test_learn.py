@@ -23,13 +23,18 @@ def clips(tmp_path_factory):
     return write_clips(tmp_path_factory.mktemp("clips"))
 
 
+@pytest.fixture(scope="module")
+def whole(clips, tmp_path_factory):
+    """The model of an undisturbed run."""
+    return learn.run(tiny(clips, checkpoint_every=100), tmp_path_factory.mktemp("whole") / "run")
+
+
 def weights(folder):
     return files.load(folder).state_dict()
 
 
-def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, tmp_path, monkeypatch):
+def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whole, tmp_path, monkeypatch):
     config = tiny(clips, checkpoint_every=100)
-    whole = learn.run(config, tmp_path / "whole")
     draw = learn.draw_clips
 
     def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
@@ -68,8 +73,8 @@ def test_outputs_and_reuse(clips, tmp_path):
         learn.run(tiny(clips, steps=5), out)
 
 
-def test_training_continues_from_a_model(clips, tmp_path):
-    first = learn.run(tiny(clips), tmp_path / "first")
+def test_training_continues_from_a_model(clips, whole, tmp_path):
+    first = whole
     second = learn.run(tiny(clips, start=str(first), seed=1), tmp_path / "second")
     before, after = weights(first), weights(second)
     assert all(torch.equal(before[n], after[n]) for n in before if n.startswith("codec."))
@@ -102,6 +107,7 @@ def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
         assert saved.step < 20
 
 
+@pytest.mark.slow
 def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
     out = tmp_path / "run"
     learn.run(tiny(clips, steps=30, lr=3e-3, checkpoint_every=100, batch_frames=8, log_every=10), out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -198,12 +199,12 @@ def test_an_output_that_touches_an_input_is_refused(name: str, world: dict[str, 
     for path in touched.values():
         through_link = tmp_path / "link" / path.relative_to(tmp_path / "in")
         places = [path, path.parent, through_link, path.parent / "x" / ".." / path.name, tmp_path / "in"]
-        for out in [*places, *([path / "inside", through_link / "deep" / "inside"] if path.is_dir() else [])]:
-            for overwrite in (False, True):
-                with pytest.raises(UsageError, match="an input") as refused:
-                    VERBS[name].call(given, out, 1, overwrite)
-                assert str(out) in refused.value.where
-                assert str(path) in refused.value.got or out == tmp_path / "in"
+        places += [path / "inside", through_link / "deep" / "inside"] if path.is_dir() else []
+        for out, overwrite in zip((path, *places), itertools.cycle((False, True))):
+            with pytest.raises(UsageError, match="an input") as refused:
+                VERBS[name].call(given, out, 1, overwrite)
+            assert str(out) in refused.value.where
+            assert str(path) in refused.value.got or out == tmp_path / "in"
     assert tree(tmp_path) == before
 
 

@@ -324,7 +324,7 @@ def batch_of(model, count=6):
     return model.encode_truth(rgb, depth, ids, torch.Generator().manual_seed(2)), encoded
 
 
-@pytest.mark.parametrize(("stage", "temporal"), [(1, "transformers"), (2, "transformers"), (2, "all")])
+@pytest.mark.parametrize(("stage", "temporal"), [(1, "transformers"), pytest.param(2, "transformers", marks=pytest.mark.slow), (2, "all")])
 def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     model = tiny_model()
     truth, encoded = batch_of(model, 3)
@@ -349,6 +349,7 @@ def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     assert moved == {n for n in before if n.startswith(("net.", "image_tokens."))} - frozen[stage, temporal]
 
 
+@pytest.mark.slow
 def test_checkpointing_gives_the_same_gradients():
     """Also where dropout draws: the second computation of a stage draws what the first one drew."""
     gradients = []
@@ -521,6 +522,7 @@ def test_models_come_back_as_they_were(street, model):
     assert torch.equal(loaded.sample(condition, SampleRequest(2)).rgb, model.sample(condition, SampleRequest(2)).rgb)
 
 
+@pytest.mark.slow
 def test_full_size_fits_ten_gigabytes():
     """Counted, not run: see docs/published.md for the table."""
     needs = memory_plan.needs_of(PublishedConfig(), 2)
@@ -554,6 +556,7 @@ def test_memory_is_counted_right():
     assert three == pytest.approx(3 * one, rel=0.02)
 
 
+@pytest.mark.slow
 def test_stage_two_freezes_the_published_number_of_weights():
     model = memory_plan.meta_model(PublishedConfig(), torch.float32)
     count = lambda parameters: sum(p.numel() for p in parameters)  # noqa: E731

@@ -52,7 +52,10 @@ def city_of(width, height):
     return world, fuse_sweeps(shots, world.tracks(), FusionRules(min_object_points=40))[0], photos
 
 
-@pytest.fixture(scope="module", params=[((1242, 375), (1024, 576)), ((640, 193), (512, 320)), ((384, 256), (256, 144))], ids=str)
+LARGE = [pytest.param(sizes, marks=pytest.mark.slow) for sizes in (((1242, 375), (1024, 576)), ((640, 193), (512, 320)))]
+
+
+@pytest.fixture(scope="module", params=[*LARGE, ((384, 256), (256, 144))], ids=str)
 def exact(request):
     """Condition of a city recorded at one size for a network of another, and the exact depth there."""
     recorded, (width, height) = request.param

@@ -123,6 +123,7 @@ def test_inputs_that_die_hide_nothing():
 @pytest.mark.parametrize(
     ("card_gb", "together", "frames"), [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)]
 )
+@pytest.mark.slow
 def test_what_fits_on_a_card(full, card_gb, together, frames):
     """At 576x1024; and a whole clip, from condition to pixels, run on the meta device as the plan says, takes no more."""
     model, needs = full
@@ -135,6 +136,7 @@ def test_what_fits_on_a_card(full, card_gb, together, frames):
     assert 0.97 * peak_bytes < counted <= 1.01 * peak_bytes
 
 
+@pytest.mark.slow
 def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
     _, needs = full
     assert needs.tower == pytest.approx(1.26e9, rel=0.01)

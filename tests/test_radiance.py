@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import SMALL_RADIANCE, fit_config
 from pretend_device import pretend_device
 from toy_world import fused_cloud, view_at, write_scene
 
@@ -34,10 +34,7 @@ from mudg.stages.radiance.storage import load_field
 
 TINY = {
     "method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4,
-    "radiance__rays": 48, "radiance__lidar_rays": 24, "radiance__proposal_samples": (16, 12), "radiance__samples": 8,
-    "radiance__static_grid": (3, 2, 4, 16, 10), "radiance__dynamic_grid": (3, 2, 4, 16, 10), "radiance__flow_grid": (2, 2, 4, 8, 9),
-    "radiance__first_proposal_grid": (2, 1, 4, 8, 9), "radiance__second_proposal_grid": (2, 1, 4, 16, 9),
-    "radiance__width": 8, "radiance__proposal_width": 8, "radiance__appearance": 4,
+    **SMALL_RADIANCE,
 }  # fmt: skip
 FEW_RAYS = {"radiance__rays": 8, "radiance__lidar_rays": 8, "radiance__proposal_samples": (6, 4), "radiance__samples": 4}
 
@@ -259,8 +256,8 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
 
 
 def test_a_short_fit_lowers_its_losses(world):
-    state, config = started(world, iterations=50, radiance__rays=96, radiance__lidar_rays=96, radiance__samples=12)
-    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 51)]
+    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
+    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 81)]
     for name in ("color", "lidar"):
         assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
 

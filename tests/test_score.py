@@ -20,6 +20,8 @@ from mudg.report import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 
+PLAIN = ScoreConfig(perceptual_views=0)
+
 
 def brighter(step: int) -> object:
     """Every channel of every pixel ``step`` grey values brighter: a mean squared error of exactly (step / 255)^2."""
@@ -44,7 +46,7 @@ def scene(tmp_path: Path) -> Path:
 def test_known_colour_error_gives_known_psnr(tmp_path: Path, scene: Path) -> None:
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), brighter(5))
     worse = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), brighter(20))
-    out = score.run(ScoreConfig(), scene, {"street_gaussians": plain, "mudg_s": worse}, tmp_path / "score")
+    out = score.run(PLAIN, scene, {"street_gaussians": plain, "mudg_s": worse}, tmp_path / "score")
     document = store.read_json(out / "metrics.json")
     for method, step in (("street_gaussians", 5), ("mudg_s", 20)):
         assert value(document, method, "front_recorded", "psnr") == pytest.approx(20 * math.log10(255 / step), abs=1e-4)
@@ -57,7 +59,7 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
         return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), spoil_training_frames)
-    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
     assert document["results"][0]["views"] == 2
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
@@ -65,14 +67,14 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
 def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
     assert document["results"][0]["views"] == 4
     assert any("No frame was held out" in rule for rule in document["rules"])
 
 
 def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
-    out = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score")
+    out = score.run(PLAIN, scene, {"a": views}, tmp_path / "score")
     document = store.read_json(out / "metrics.json")
     assert document["truth"] == "recorded"
     assert value(document, "a", "front_shift+2.0", "psnr") == score_tables.NO_TRUTH
@@ -86,7 +88,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
         return dataclasses.replace(seen, depth=None, semantics=None)
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), color_only)
-    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
     assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
     assert value(document, "a", "front_recorded", "miou") == "not produced"
     assert value(document, "a", "front_recorded", "psnr") == 100.0
@@ -95,7 +97,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
 def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
     assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
     assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
 
@@ -105,7 +107,7 @@ def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
         return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), no_depth_anywhere)
-    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
     true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
     expected = float(np.mean((80.0 - true) / true))
     assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
@@ -126,7 +128,7 @@ def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path,
 
     small = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), half)
     full = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,))
-    out = score.run(ScoreConfig(), scene, {"a": small, "b": full}, tmp_path / "score")
+    out = score.run(PLAIN, scene, {"a": small, "b": full}, tmp_path / "score")
     document = store.read_json(out / "metrics.json")
     course = document["trajectories"][0]
     assert (course["width"], course["height"]) == (toy_views.WIDTH, toy_views.HEIGHT)
@@ -149,7 +151,7 @@ def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Pa
     index["observations"] = index["observations"][:3]
     store.write_json(part / "front_recorded" / "observations.json", index)
     document = store.read_json(
-        score.run(ScoreConfig(), scene, {"a": full, "b": part}, tmp_path / "score") / "metrics.json"
+        score.run(PLAIN, scene, {"a": full, "b": part}, tmp_path / "score") / "metrics.json"
     )
     assert document["trajectories"][0]["views"] == 3
     assert {r["views"] for r in document["results"]} == {1}
@@ -160,25 +162,25 @@ def test_methods_must_stand_in_the_same_place(tmp_path: Path, scene: Path) -> No
     there = toy_views.write_views(scene, tmp_path / "b", "b", (3.0,))
     (there / "front_shift+3.0").rename(there / "front_shift+2.0")
     with pytest.raises(InputError, match="different positions"):
-        score.run(ScoreConfig(), scene, {"a": here, "b": there}, tmp_path / "score")
+        score.run(PLAIN, scene, {"a": here, "b": there}, tmp_path / "score")
 
 
 def test_nothing_to_score_is_said(tmp_path: Path, scene: Path) -> None:
     with pytest.raises(UsageError):
-        score.run(ScoreConfig(), scene, {}, tmp_path / "score")
+        score.run(PLAIN, scene, {}, tmp_path / "score")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="none of the folders"):
-        score.run(ScoreConfig(), scene, {"a": tmp_path / "empty"}, tmp_path / "score2")
+        score.run(PLAIN, scene, {"a": tmp_path / "empty"}, tmp_path / "score2")
 
 
 def test_a_finished_score_is_reused_and_another_configuration_refused(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    out = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score")
+    out = score.run(PLAIN, scene, {"a": views}, tmp_path / "score")
     before = (out / "metrics.json").stat().st_mtime_ns
-    score.run(ScoreConfig(), scene, {"a": views}, out)
+    score.run(PLAIN, scene, {"a": views}, out)
     assert (out / "metrics.json").stat().st_mtime_ns == before
     with pytest.raises(UsageError, match="another configuration"):
-        score.run(ScoreConfig(width_px=24), scene, {"a": views}, out)
+        score.run(ScoreConfig(width_px=24, perceptual_views=0), scene, {"a": views}, out)
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
@@ -271,5 +273,5 @@ def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), lambda _i, seen: dataclasses.replace(
         seen, depth=torch.full_like(seen.depth, 12.0)
     ))  # fmt: skip
-    document = store.read_json(score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m

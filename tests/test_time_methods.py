@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import SMALL_RADIANCE, fit_config
 from pretend_device import pretend_device
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
@@ -439,7 +439,7 @@ def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
 
 
 def fitted_to(worlds: dict[str, Path], name: str, out: Path, method: str, iterations: int = 4) -> Path:
-    small = {"radiance__rays": 16, "radiance__lidar_rays": 16} if method == "emernerf" else {}
+    small = SMALL_RADIANCE if method == "emernerf" else {}
     return fit.run(settings(method, iterations=iterations, **small), worlds[name], worlds[f"{name}-fuse"], out / name)
 
 

@@ -58,9 +58,14 @@ def converted(tmp_path, content, config=CONFIG):
 # names ----------------------------------------------------------------------------------------------------------------
 
 
-def test_every_published_tensor_is_accounted_for(published_keys):
+@pytest.fixture(scope="module")
+def wanted():
+    """Names and shapes of the full-size network."""
+    return convert.wanted_shapes(PublishedConfig())
+
+
+def test_every_published_tensor_is_accounted_for(published_keys, wanted):
     """The full-size network wants exactly the published names and shapes; what is left over is on the list of the unused."""
-    wanted = convert.wanted_shapes(PublishedConfig())
     published = weights.published_names(wanted)
     assert len(published_keys) == 2524
     assert {published[name]: shape for name, shape in wanted.items()} == {
@@ -69,8 +74,7 @@ def test_every_published_tensor_is_accounted_for(published_keys):
     assert len(published) + len(set(published_keys) & weights.UNUSED) == 2524
 
 
-def test_the_map_of_names_is_one_to_one():
-    wanted = convert.wanted_shapes(PublishedConfig())
+def test_the_map_of_names_is_one_to_one(wanted):
     assert len(set(weights.published_names(wanted).values())) == len(wanted)
     with pytest.raises(InputError, match="lacks a tensor"):
         weights.published_names(["net.nothing"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 from importlib import metadata
@@ -16,8 +17,10 @@ def version() -> str:
         return "0+unknown"
 
 
+@functools.cache
 def environment() -> dict[str, Any]:
-    """Versions and machine facts that results may depend on. Holds no host name, user name or path."""
+    """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once: metadata
+    is parsed anew at every question."""
     packages = {}
     for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av"):
         try:
