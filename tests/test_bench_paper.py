@@ -397,7 +397,7 @@ def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
                   for row in ("truth", *(row.name for row in job.rows))}  # fmt: skip
         return {**toy_logs(FIDS)[0], "log": job.log.name, "values": values}
 
-    monkeypatch.setattr(paper._Log, "measure", stand_in)
+    monkeypatch.setattr(paper.PaperLog, "measure", stand_in)
     config = BenchConfig(logs=1, methods=("gs3d",), processes=1, videos=False)
     out = bench.run("paper", config, tmp_path / "out", sources=("city:development",))
     assert {path.name for path in out.iterdir()} == set(paper.PAGES)

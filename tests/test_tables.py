@@ -6,14 +6,24 @@ import io
 import pytest
 
 from mudg.report import html
-from mudg.report.tables import PUBLISHED, Cell, Line, Table, best_of, csv_text, latex, markdown, markdown_table
+from mudg.report.tables import (
+    PUBLISHED,
+    TextCell,
+    TextLine,
+    TextTable,
+    best_of,
+    csv_text,
+    latex,
+    markdown,
+    markdown_table,
+)
 
-TABLE = Table(
+TABLE = TextTable(
     ("", "FID ↓", "a_b"),
     (
-        Line("A paper's & method", (Cell("50.00"), Cell("")), PUBLISHED),
-        Line("the truth", (Cell("6.00"), Cell("-", reason="no weights")), "anchor"),
-        Line("ours (mudg_s)", (Cell("45 %", best=True), Cell("-", reason="no weights")), "ours"),
+        TextLine("A paper's & method", (TextCell("50.00"), TextCell("")), PUBLISHED),
+        TextLine("the truth", (TextCell("6.00"), TextCell("-", reason="no weights")), "anchor"),
+        TextLine("ours (mudg_s)", (TextCell("45 %", best=True), TextCell("-", reason="no weights")), "ours"),
     ),
     "2 m",
 )
@@ -41,7 +51,7 @@ def test_csv_quotes_what_it_must():
 
 
 def test_a_page_escapes_cells_and_marks_lines():
-    evil = Table(("", "n"), (Line("<script>", (Cell("<b>", best=True),), "n"),), "<i>")
+    evil = TextTable(("", "n"), (TextLine("<script>", (TextCell("<b>", best=True),), "n"),), "<i>")
     text = html.render("bench.html.j2", title="t", kicker="k", lead="l", footer="", sections=[
         {"title": "s", "tables": [TABLE, evil], "notes": [], "below": [], "films": [], "walls": [], "log_choices": [], "shift_choices": []},
     ])  # fmt: skip

@@ -44,7 +44,7 @@ from mudg.data.edits import EditScript, parse_edits
 from mudg.data.exporters.video import jpeg_bytes
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
-from mudg.report.tables import Table, cells, markdown_table
+from mudg.report.tables import TextTable, cells, markdown_table
 from mudg.stages.config import BenchConfig
 from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.assets import asset_from, read_asset, write_asset
@@ -286,7 +286,7 @@ def page(doc: Mapping[str, Any], out: Path) -> str:
         "Edited drives", "mudg bench edit",
         "Recorded drives, edited, against their unedited fits. The pictures show your recordings: share this page with care.",
         [
-            {"title": "Numbers", "tables": [Table.of_texts(HEADS, map(_cells, doc["rows"]))]},
+            {"title": "Numbers", "tables": [TextTable.of_texts(HEADS, map(_cells, doc["rows"]))]},
             {"title": "Pictures", "walls": walls,
              "notes": ["Difference: mean of the channels, black = equal, through red to white = 0.35 or more."]},
         ],

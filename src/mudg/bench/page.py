@@ -112,7 +112,7 @@ def render(title: str, command: str, lead: str, sections: Sequence[Mapping[str, 
     """A page.
 
     Args:
-        command: what makes it. lead: first sentence. sections: each with ``title``, and any of ``tables`` (``report.tables.Table``),
+        command: what makes it. lead: first sentence. sections: each with ``title``, and any of ``tables`` (``report.tables.TextTable``),
             ``notes`` above and ``below`` them, the values of `films`, and ``walls``. footer: where the pictures lie.
     """
     usual = {"tables": (), "notes": (), "below": (), "films": (), "walls": (), "log_choices": (), "shift_choices": ()}

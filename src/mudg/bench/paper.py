@@ -30,7 +30,7 @@ from mudg.base.errors import InputError
 from mudg.base.run_folder import refuse_overlap
 from mudg.bench import page as pages
 from mudg.bench.loop import compare, refuse_foreign, seconds_of
-from mudg.bench.papers import PAPERS, TABLES, Column, PaperTable
+from mudg.bench.papers import PAPERS, TABLES, PaperColumn, PaperTable
 from mudg.bench.places import ListedCity, first_camera, logs_of, missing_scenes
 from mudg.bench.rows import FILL, REPAIRED, Row, chain_settings, generator_of, paper_rows, refuse_unfit
 from mudg.bench.shift import standard_error, virtual_fits_of
@@ -39,7 +39,7 @@ from mudg.core.metrics import METRICS
 from mudg.methods import METHODS
 from mudg.models.mdm import files as mdm_files
 from mudg.report.score_tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
-from mudg.report.tables import PUBLISHED, Cell, Line, Table, best_of, csv_text, latex, markdown_table
+from mudg.report.tables import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
 from mudg.report.tables import markdown as rendered
 from mudg.stages.config import BenchConfig, PresetName, ScoreConfig
 from mudg.stages.scoring.distributions import FEATURES_FOLDER, FEWEST, distances
@@ -65,7 +65,7 @@ Values = dict[str, dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class _Log(Views):
+class PaperLog(Views):
     """One log under a table."""
 
     @property
@@ -135,7 +135,7 @@ def run(
     measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
     fill = Row(FILL, ANCHORS[FILL])
     jobs = [
-        _Log(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite) for log in logs
+        PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite) for log in logs
     ]  # fmt: skip
     settings = {
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "", "missing_scenes": missing_scenes(table, logs),
@@ -153,7 +153,7 @@ def _weights_of(config: ScoreConfig) -> dict[str, str]:
     return {name: value for name, value in result.items() if name.endswith("weights") or Path(value).exists()}
 
 
-def further_columns(exact: bool) -> tuple[Column, ...]:
+def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
     """The further columns of logs with or without exact truth, as far as `mudg score` has them."""
     return tuple(PAPERS.columns[key] for key in PAPERS.further["exact" if exact else "measured"] if key in METRICS)
 
@@ -161,7 +161,7 @@ def further_columns(exact: bool) -> tuple[Column, ...]:
 # ---- values of one log at a place ----
 
 
-def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[Column]) -> Values:
+def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
     """Values of one method on one log at a place.
 
     Args:
@@ -174,7 +174,7 @@ def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], colum
     return {column.key: _value(column, rows) if column.key in known else {"value": NOT_SCORED} for column in columns}
 
 
-def _value(column: Column, rows: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
+def _value(column: PaperColumn, rows: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
     values = [None if row is None else row["values"].get(column.key, NOT_COMPUTED) for row in rows]
     reasons = [value for value in values if isinstance(value, str)]
     if reasons or None in values:
@@ -184,14 +184,14 @@ def _value(column: Column, rows: Sequence[Mapping[str, Any] | None]) -> dict[str
     return result | ({"n_reference": sum(int(of["n_reference"]) for of in counts)} if column.counts else {})
 
 
-def _reason(column: Column, reason: str) -> str:
+def _reason(column: PaperColumn, reason: str) -> str:
     if reason == NOT_COMPUTED and column.needs:
         what = "no weights" if column.needs.endswith("_weights") else "not given"
         return f"{what}: --score.{column.needs.replace('_', '-')}"
     return "no truth off the path on a recorded log" if reason == NO_TRUTH else reason
 
 
-def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[Column]) -> Values:
+def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
     """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views alone."""
     result: Values = {}
     for column in columns:
@@ -319,7 +319,7 @@ def document(
 
 
 def _cell(
-    logs: Sequence[Mapping[str, Any]], row: str, place: str, column: Column, pooled: Mapping[str, Any] | None
+    logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn, pooled: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """Mean over all logs, or the value of their ``pooled`` sets; or the reason why there is none."""
     values = [entry["values"][row][place].get(column.key, {"value": NOT_SCORED}) for entry in logs]
@@ -335,7 +335,7 @@ def _cell(
     return result if pooled is None else {**result, **pooled, "mean_over_logs": fmean(numbers)}
 
 
-def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: Column) -> None:
+def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: PaperColumn) -> None:
     """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table, with the reason.
 
     Raises:
@@ -419,7 +419,7 @@ def _empty_columns(doc: Mapping[str, Any]) -> dict[str, dict[str, None]]:
     return of
 
 
-def main_table(doc: Mapping[str, Any]) -> Table:
+def main_table(doc: Mapping[str, Any]) -> TextTable:
     """The table: published rows, ours, and the numbers of views."""
     wanted, columns = [tuple(cell) for cell in doc["table"]["cells"]], _columns(doc)
     titles = {place["name"]: place["title"] for place in doc["table"]["places"]}
@@ -428,16 +428,16 @@ def main_table(doc: Mapping[str, Any]) -> Table:
     for row in doc["published"]:
         values = {(place, key): value for place, key, value in row["values"]}
         if values.keys() & set(wanted):
-            cells = tuple(Cell(_digits(values[cell], columns[cell[1]]) if cell in values else "") for cell in wanted)
-            lines.append(Line(f"{row['title']} ({PUBLISHED}: {row['source']})", cells, PUBLISHED))
-    return Table(tuple(heads), (*lines, *_ours(doc, wanted)))
+            cells = tuple(TextCell(_digits(values[cell], columns[cell[1]]) if cell in values else "") for cell in wanted)
+            lines.append(TextLine(f"{row['title']} ({PUBLISHED}: {row['source']})", cells, PUBLISHED))
+    return TextTable(tuple(heads), (*lines, *_ours(doc, wanted)))
 
 
-def further_tables(doc: Mapping[str, Any]) -> list[Table]:
+def further_tables(doc: Mapping[str, Any]) -> list[TextTable]:
     """The further columns, one table per place."""
     columns = doc["further"]
     return [
-        Table(("", *map(_headed, columns)), tuple(_ours(doc, [(place["name"], column["key"]) for column in columns])), place["title"])
+        TextTable(("", *map(_headed, columns)), tuple(_ours(doc, [(place["name"], column["key"]) for column in columns])), place["title"])
         for place in doc["table"]["places"] if columns
     ]  # fmt: skip
 
@@ -446,21 +446,21 @@ def _headed(column: Mapping[str, Any]) -> str:
     return f"{column['title']} {ARROWS[column['better']]}"
 
 
-def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator[Line]:
+def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
     shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
     for row in doc["rows"]:
-        cells = (Cell(NONE, reason=shared[cell]) if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)
-        yield Line(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
-    yield Line("n", tuple(Cell(_count(doc, *cell)) for cell in wanted), "n")
+        cells = (TextCell(NONE, reason=shared[cell]) if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)
+        yield TextLine(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
+    yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
 
 
-def _printed(doc: Mapping[str, Any], row: str, place: str, key: str) -> Cell:
+def _printed(doc: Mapping[str, Any], row: str, place: str, key: str) -> TextCell:
     result, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in result:
-        return Cell(result["reason"], reason=result["reason"])
+        return TextCell(result["reason"], reason=result["reason"])
     error = result["standard_error"]
     behind = "" if error is None else f" ({_digits(error, column)})"
-    return Cell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
+    return TextCell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
 
 
 def _digits(value: float, column: Mapping[str, Any]) -> str:
@@ -526,7 +526,7 @@ def page(doc: Mapping[str, Any]) -> str:
         [
             {"title": "Table", "tables": [main_table(doc)], "below": notes}, *further,
             pages.films(doc, doc["logs"][0]["columns"], videos=doc["settings"]["videos"], exact=doc["exact"]),
-            {"title": "Logs", "tables": [Table.of_texts(LOG_HEADS, map(_log_cells, doc["logs"]))]},
+            {"title": "Logs", "tables": [TextTable.of_texts(LOG_HEADS, map(_log_cells, doc["logs"]))]},
         ],
         "The pictures lie beside this page.",
     )  # fmt: skip

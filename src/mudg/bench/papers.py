@@ -30,7 +30,7 @@ class SceneRange(StrictRecord):
     side: int = 1
 
 
-class Place(StrictRecord):
+class PaperPlace(StrictRecord):
     """Where views are scored.
 
     Args:
@@ -49,7 +49,7 @@ class Place(StrictRecord):
         return (*("recorded" if not s else f"shift{s:+.1f}" for s in shifts), *self.paths)
 
 
-class Column(StrictRecord):
+class PaperColumn(StrictRecord):
     """A number of ``metrics.json``: its name there, heading, better side, digits, the setting of ``mudg score`` that it needs, and the
     entry of a result that holds its ``n`` (empty: the views that count)."""
 
@@ -89,8 +89,8 @@ class PaperTable(StrictRecord):
     title: str = ""
     data: str = ""
     scenes: str = ""
-    places: list[Place]
-    columns: list[Column]
+    places: list[PaperPlace]
+    columns: list[PaperColumn]
     published: list[PublishedRow] = []
     only: dict[str, list[str]] = {}
     rows: list[PaperRow] = []
@@ -102,7 +102,7 @@ class PaperTable(StrictRecord):
     virtual_shifts_m: list[float] = []
     notes: list[str] = []
 
-    def cells(self) -> tuple[tuple[Place, Column], ...]:
+    def cells(self) -> tuple[tuple[PaperPlace, PaperColumn], ...]:
         """All places and columns, in the order of the table."""
         return tuple((p, c) for p in self.places for c in self.columns if c.key in self.only.get(p.name, (c.key,)))
 
@@ -132,7 +132,7 @@ class PaperTable(StrictRecord):
 class Papers(StrictRecord):
     """All of ``papers.yaml``."""
 
-    columns: dict[str, Column]
+    columns: dict[str, PaperColumn]
     further: dict[Literal["exact", "measured"], list[str]]
     scene_lists: dict[str, list[SceneRange]]
     tables: dict[str, PaperTable]

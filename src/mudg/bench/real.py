@@ -46,7 +46,7 @@ from mudg.bench.truth import read_targets, write_targets
 from mudg.data.scene import SCENE_FILES, read_scene
 from mudg.data.scene.part import write_part
 from mudg.models.mdm import files as mdm_files
-from mudg.report.tables import Table, markdown_table
+from mudg.report.tables import TextTable, markdown_table
 from mudg.report.tables import markdown as rendered
 from mudg.stages import adapt, render
 from mudg.stages.adapting.clips import why_not
@@ -309,7 +309,7 @@ def document(
 # ---- text ----
 
 
-def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
+def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping[str, Any]]) -> TextTable:
     """A method's values, each in brackets with its comparison with the fit without diffusion."""
     columns = doc["protocols"][protocol]["row"]["columns"]
     rows = []
@@ -319,7 +319,7 @@ def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping
             more = "" if method == BASE or BASE not in values else COLUMNS[name].compared_text(of[name], values[BASE][name])
             cells.append(COLUMNS[name].text(of[name]) + (f" ({more})" if more else ""))
         rows.append(cells)
-    return Table.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
+    return TextTable.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
 
 
 def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
@@ -407,7 +407,7 @@ def page_of(doc: Mapping[str, Any], out: Path) -> str:
     Args:
         out: folder of the benchmark, with the pictures.
     """
-    logs = Table.of_texts(LOG_HEADS, map(log_cells, doc["logs"]))
+    logs = TextTable.of_texts(LOG_HEADS, map(log_cells, doc["logs"]))
     sections = [{"title": "Logs", "tables": [logs]}, *(_section(doc, name, out) for name in doc["protocols"])]
     return pages.render("Real logs", "mudg bench real", summary_of(doc), sections)
 

@@ -20,14 +20,14 @@ from mudg.base import config as configuration
 from mudg.base.run_folder import refuse_overlap
 from mudg.bench import page as pages
 from mudg.bench.loop import compare, refuse_foreign, seconds_of
-from mudg.bench.papers import RECORDED, PaperTable, Place
+from mudg.bench.papers import RECORDED, PaperPlace, PaperTable
 from mudg.bench.places import listed_cities
 from mudg.bench.rows import BASE, DIFFUSION, EXACT, FILL, FULL, chain_settings, generator_of, refuse_unfit, shift_rows
 from mudg.bench.views import Views, score_settings
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.models.mdm import files as mdm_files
-from mudg.report.tables import Table, markdown_table
+from mudg.report.tables import TextTable, markdown_table
 from mudg.stages.config import BenchConfig, PresetName
 
 SHIFTED: Final = "shifted"
@@ -58,7 +58,7 @@ _PAGES: Final = ("bench.json", "bench.md", "page.html")
 
 
 @dataclass(frozen=True)
-class _Log(Views):
+class ShiftLog(Views):
     """One log of the list."""
 
     @property
@@ -104,10 +104,11 @@ def run(
     refuse_foreign(
         out, _PAGES, lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc, lambda entry: entry.name.isdigit()
     )
-    places = [Place(name=RECORDED, title="", shifts_m=[0.0]), *(Place(name=f"{d:g}", title="", shifts_m=[d, -d]) for d in distances_m)]
+    shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
+    places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
     table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
     jobs = [
-        _Log(log, out / log.name, table, rows, config, score_settings(config, table), renders, overwrite, "synthesize", on_path=False)
+        ShiftLog(log, out / log.name, table, rows, config, score_settings(config, table), renders, overwrite, "synthesize", on_path=False)
         for log in listed_cities(config.list, config.logs, rules)
     ]
     refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
@@ -276,7 +277,9 @@ def page(doc: Mapping[str, Any]) -> str:
     heads = ["method", *(heading for heading, _ in COLUMNS.values())]
     compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
     scores = [
-        Table.of_texts(heads, [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names], _place_title(doc, place))
+        TextTable.of_texts(
+            heads, [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names], _place_title(doc, place)
+        )
         for place in (mean, *places)
     ]
     videos = pages.films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
@@ -286,9 +289,9 @@ def page(doc: Mapping[str, Any]) -> str:
         "both sides of the path.",
         [
             *([videos] if videos["films"] else []),
-            {"title": "Comparisons", "tables": [Table.of_texts(["", "value", "standard error", "as", "logs"], compared)]},
+            {"title": "Comparisons", "tables": [TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)]},
             {"title": "Scores", "tables": scores},
-            {"title": "Logs", "tables": [Table.of_texts(FACTS, map(_facts, doc["logs"]))]},
+            {"title": "Logs", "tables": [TextTable.of_texts(FACTS, map(_facts, doc["logs"]))]},
         ],
         "The videos lie beside this page.",
     )  # fmt: skip

@@ -17,7 +17,7 @@ _LATEX: Final = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class TextCell:
     """A cell: ``best``, the best number of its column; ``reason``, why there is no number."""
 
     text: str
@@ -26,29 +26,29 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Line:
+class TextLine:
     """A line of a table: its title and its cells. ``kind`` is its class on pages."""
 
     title: str
-    cells: tuple[Cell, ...]
+    cells: tuple[TextCell, ...]
     kind: str = ""
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """A table: headings, the first above the titles of the lines; ``title`` above it, on pages and in LaTeX."""
 
     heads: tuple[str, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[TextLine, ...]
     title: str = ""
 
     @classmethod
-    def of_texts(cls, heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> Table:
+    def of_texts(cls, heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> TextTable:
         """A table of plain texts; the first of every row is its title."""
-        return cls(tuple(heads), tuple(Line(row[0], tuple(map(Cell, row[1:]))) for row in rows), title)
+        return cls(tuple(heads), tuple(TextLine(row[0], tuple(map(TextCell, row[1:]))) for row in rows), title)
 
 
-def markdown(table: Table) -> list[str]:
+def markdown(table: TextTable) -> list[str]:
     """Lines of a Markdown table; the best numbers are bold."""
     rows = [(line.title, *(f"**{cell.text}**" if cell.best else cell.text for cell in line.cells)) for line in table.lines]
     first, *others = ("| " + " | ".join(cells) + " |" for cells in (table.heads, *rows))
@@ -57,7 +57,7 @@ def markdown(table: Table) -> list[str]:
 
 def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Lines of a Markdown table of plain texts."""
-    return markdown(Table.of_texts(heads, rows))
+    return markdown(TextTable.of_texts(heads, rows))
 
 
 def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
@@ -65,7 +65,7 @@ def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
     return ["-" if row[key] is None else form.format(row[key]) for key, form in forms.items()]
 
 
-def latex(table: Table) -> list[str]:
+def latex(table: TextTable) -> list[str]:
     """Lines of a LaTeX ``tabular``; reasons behind cells without a number (--) are comments above it."""
     heads = table.heads[1:]
     reasons = dict.fromkeys(f"{h}: {c.reason}" for line in table.lines for h, c in zip(heads, line.cells, strict=True) if c.reason)
