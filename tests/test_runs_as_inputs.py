@@ -128,9 +128,8 @@ def test_help_all_works_for_every_verb(verb: str, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("page", "shown", "others"),
     [
-        ("batch status", ("--html", "--watch-s"), ("--stages", "--preset", "--price", "--reason")),
-        ("batch cost", ("--price", "--storage-price"), ("--stages", "--html")),
-        ("batch accept", ("--scenes",), ("--stages", "--price")),
+        ("batch status", ("--html", "--watch-s", "--price"), ("--stages", "--preset", "--reason", "--shard")),
+        ("batch retry", ("--reason",), ("--stages", "--html", "--price")),
         ("batch run", ("--list", "--stages", "--engine", "--set"), ("--watch-s", "--reason", "--price")),
         ("bench paper", ("--table", "--iterations"), ("--protocols", "--sampler", "--variant")),
         ("bench mdm", ("--steps", "--cities"), ("--table", "--protocols", "--score.width-px")),

@@ -221,16 +221,10 @@ def _batch(args: f.BatchFlags) -> dict[str, Any]:
         if not args.list:
             raise UsageError("no list was given", expected="--list FILE, with one source per line")
         settings = batch.settings_of(args.preset, args.config, args.set)
-        asked = batch.BatchRequest(args.list, place, args.settings, settings, tuple(sys.argv[1:]), args.wait, args.scratch)
+        asked = batch.BatchRequest(args.list, place, args.settings, settings, args.shard, args.wait, args.scratch, args.take_over)
         return batch.run(asked, args.dry_run)
     if args.action == "status":
-        return batch.watch_status(place, args.html, args.watch_s)
-    if args.action == "cost":
-        return batch.show_cost(place, args.settings.price, args.settings.storage_price)
-    if args.action == "review":
-        return batch.show_review(place)
-    if args.action in ("accept", "reject"):
-        return batch.judge(place, args.settings.scenes, args.action == "accept")
+        return batch.show_status(place, args.html, args.settings.price, args.watch_s)
     return batch.retry(place, args.reason)
 
 
@@ -374,11 +368,11 @@ VERBS: dict[str, Verb] = {
         "smaller views (--width-px), fewer --views",
     ),
     "batch": Verb(
-        "Process long lists of logs, on this machine, Slurm, Ray or any scheduler; show progress, failures and costs.",
+        "Process long lists of logs, on this machine, Ray, Slurm or any scheduler; show progress, failures and costs.",
         ("mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
-         "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine slurm --shards 500 --config recipe.yaml",
-         "mudg batch status runs --html", "mudg batch retry runs --reason 5,137", "mudg batch review runs",
-         "mudg batch cost runs --price 0.04"),
+         "mudg batch run --list logs.txt --out /shared/runs --engine slurm --jobs 500 --slurm-options time=4:00:00 --config recipe.yaml",
+         "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine ray --ray-address auto --cpus 4 --gpus 1",
+         "mudg batch status runs --html --price 0.04", "mudg batch retry runs --reason 5,137"),
         _batch,
         "fewer --jobs, or smaller images (--set ingest.resolution=960)",
     ),

@@ -392,9 +392,9 @@ class BenchListed(BenchInputs):
 class BatchFlags(Common):
     """Flags of ``mudg batch``."""
 
-    action: Annotated[Literal["run", "status", "cost", "retry", "review", "accept", "reject"], tyro.conf.Positional, arg(metavar="ACTION")]
-    """run: process a list, or go on with it. status: how far it is. cost: core-hours, bytes and money. retry: forget failures, so that run
-    tries again. review: results outside the bounds, with pictures. accept, reject: those of --scenes."""
+    action: Annotated[Literal["run", "status", "retry"], tyro.conf.Positional, arg(metavar="ACTION")]
+    """run: process a list, or go on with it. status: how far it is, what failed, what it took. retry: forget failures, so that run tries
+    again."""
     place: Annotated[str, tyro.conf.Positional, arg(metavar="[OUT]")] = ""
     """All but run: folder or address of a batch."""
     out: Annotated[str, arg(metavar="FOLDER|URL")] = ""
@@ -407,10 +407,15 @@ class BatchFlags(Common):
     """run: settings of the steps, over those of --config, as fit.iterations=500 device=cpu."""
     dry_run: FlagCreatePairsOff[bool] = False
     """run: only say what there is to do."""
+    shard: Annotated[str, arg(metavar="I/N")] = ""
+    """run: only the I-th of N parts of the list, from 0. env, env/N: the I-th as the scheduler numbers this task (SLURM_ARRAY_TASK_ID,
+    JOB_COMPLETION_INDEX, SKYPILOT_NODE_RANK or AWS_BATCH_JOB_ARRAY_INDEX)."""
     wait: FlagCreatePairsOff[bool] = False
     """run: with --engine slurm, wait for the end of the job."""
+    take_over: FlagCreatePairsOff[bool] = False
+    """run: go on although a driver on another machine may still work on the batch."""
     reason: str = ""
-    """retry: only these exit codes or reasons, with commas, e.g. 5,137 or quality (empty = all)."""
+    """retry: only these exit codes, with commas, e.g. 5,137 (empty = all)."""
     html: FlagCreatePairsOff[bool] = False
     """status: also write OUT/status.html, with figures of the logs."""
     watch_s: float = 0.0
@@ -456,10 +461,8 @@ OWNERS = {"batch": "run", "asset": "import"}
 """Part of a verb that its settings belong to, where their texts name no other."""
 PARTS: dict[str, dict[str, str]] = {
     "batch": {
-        "run": "Process a list of logs, or go on with it.", "status": "Show how far a batch is.",
-        "cost": "Show core-hours, bytes and money of a batch.", "retry": "Forget failures, so that run tries again.",
-        "review": "Show results outside the bounds, with pictures.", "accept": "Accept results that wait for review.",
-        "reject": "Reject results that wait for review.",
+        "run": "Process a list of logs, or go on with it.", "status": "Show how far a batch is, what failed and what it took.",
+        "retry": "Forget failures, so that run tries again.",
     },
     "asset": {
         "export": "Write one object of a fitted scene to a file that edit scripts can insert.",
