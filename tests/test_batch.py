@@ -13,7 +13,7 @@ from toy_scene import ToyStreet
 from mudg import app
 from mudg.base.errors import InputError, UsageError
 from mudg.data.scene import read_scene
-from mudg.stages.batches import lists
+from mudg.stages.batches import plan as lists
 from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.batches.plan import BatchPlan, BatchStage
 
@@ -65,15 +65,14 @@ def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words:
 
 def test_shards_are_a_partition_that_growing_lists_keep() -> None:
     entries = [lists.Entry(str(n), str(n)) for n in range(60)]
-    parts = [lists.shard(entries, f"{i}/3") for i in range(3)]
+    parts = [lists.shard(entries, (i, 3)) for i in range(3)]
     assert sorted(int(e.name) for part in parts for e in part) == list(range(60))
     assert min(map(len, parts)) >= 10
-    for part, fewer in zip(parts, [lists.shard(entries[:20], f"{i}/3") for i in range(3)], strict=True):
+    for part, fewer in zip(parts, [lists.shard(entries[:20], (i, 3)) for i in range(3)], strict=True):
         assert part[: len(fewer)] == fewer
-    assert lists.shard(entries, "") == entries
     for text in ("3/3", "1", "a/b", "-1/3", "1/0"):
         with pytest.raises(UsageError, match="shard"):
-            lists.shard(entries, text)
+            lists.parse_shard(text)
 
 
 def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -134,7 +133,7 @@ def test_many_scenes_fused_by_shards(tmp_path: Path) -> None:
         ToyStreet(wall_x=20.0 + index).write(tmp_path / "scenes" / name, width=60, height=30)
     (tmp_path / "scenes" / "status.json").write_text("{}")
     first = [name for name in ("one", "two", "three") if lists.shard_of(name, 2) == 0]
-    expected = sorted(["_batch", "status-0-of-2.json", *first])
+    expected = sorted(["status-0-of-2.json", *first])
     words = ["fuse", "--list", str(tmp_path / "scenes"), "--out", str(tmp_path / "fused"), "--quiet", "--shard"]
     assert app.main([*words, "0/2"]) == 0
     assert sorted(p.name for p in (tmp_path / "fused").iterdir()) == expected

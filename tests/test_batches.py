@@ -1,16 +1,17 @@
-"""Batches: claims, retries, takeover, stop and resume, bounds, second runs, status and costs."""
+"""Batches: keys, steps that are killed, stopped and tried again, who drives, retry, status, and the command line."""
 
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -19,44 +20,70 @@ from mudg import app
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.stages import batch
-from mudg.stages.batches import claims, costs, engines, quality, retries, slurm, status, work
-from mudg.stages.batches.children import Ending, last_words
-from mudg.stages.batches.folders import BatchFolder
-from mudg.stages.batches.lists import Entry, read_list, shard_of
-from mudg.stages.batches.plan import BatchPlan, BatchStage, command_of, plan_of
-from mudg.stages.batches.scratch import WorkFolder
+from mudg.stages.batches import engines, status, work
+from mudg.stages.batches.child import Stop, last_words, run_step
+from mudg.stages.batches.engines import LocalRun
+from mudg.stages.batches.plan import BatchPlan, BatchStage, Entry, command_of, parse_shard, plan_of, read_list, shard_of
+from mudg.stages.batches.records import BatchFolder, this_host
+from mudg.stages.batches.work import Job, Report, facts_of
 from mudg.stages.config import BatchConfig, RunConfig
 
-COMMAND = ("program", "{source}", "{out}")
-OWNER = claims.Owner("here")
+STEP = """
+# step.sh NAME OUT TALLY: a line per run; then what is in TALLY/NAME.do, or a small result
+echo run >> "$3/$1.runs"
+[ -f "$3/$1.do" ] && . "$3/$1.do"
+mkdir -p "$2" && echo "result of $1" > "$2/x.txt"
+"""
 
 
-def entries(count: int) -> list[Entry]:
-    return [Entry(f"scene{number:03d}", f"/logs/{number}") for number in range(count)]
+class Scenes:
+    """A list of scenes, a step, and what is to happen to single ones."""
+
+    def __init__(self, folder: Path, count: int = 3, out: Location | None = None) -> None:
+        self.folder, self.tally = folder, folder / "tally"
+        self.tally.mkdir(parents=True, exist_ok=True)
+        (folder / "step.sh").write_text(STEP)
+        self.entries = [Entry(f"s{number}", f"/logs/{number}") for number in range(count)]
+        self.command = ("sh", str(folder / "step.sh"), "{name}", "{out}", str(self.tally))
+        self.plan = plan_of((), {}, self.command)
+        self.batch = BatchFolder(out or Location.of(folder / "out"))
+        (folder / "list.txt").write_text("".join(f"city name={entry.name}\n" for entry in self.entries))
+
+    def does(self, name: str, script: str) -> None:
+        (self.tally / f"{name}.do").write_text(script)
+
+    def run(self, jobs: int = 1, scratch: Path | None = None, threads: int = 1, stop: Stop | None = None) -> dict[str, int]:
+        """Run what is missing; how many steps ended how."""
+        self.batch.begin(self.plan, self.entries)
+        reports: list[Report] = []
+        job = Job(self.batch, self.plan, threads, grace_s=5.0, scratch=scratch)
+        done, failed = self.batch.keys("done"), self.batch.keys("failed")
+        entries = [entry for entry in self.entries if work.is_open(self.plan, entry, done, failed)]
+        LocalRun(job, entries, jobs, stop or Stop(5.0)).run(reports.append)
+        return dict(Counter(report.state for report in reports))
+
+    def runs(self) -> dict[str, int]:
+        return {path.stem: len(path.read_text().splitlines()) for path in sorted(self.tally.glob("*.runs"))}
+
+    def digests(self) -> dict[str, str]:
+        return {one.scene: one.digest for one in self.batch.records("done")}
+
+    def words(self, *more: str) -> list[str]:
+        return ["batch", "run", "--list", str(self.folder / "list.txt"), "--out", str(self.batch.out), "--quiet", *more,
+                "--command", *self.command]  # fmt: skip
 
 
-def request(out: Path, count: int = 3, **rules: object) -> work.WorkRequest:
-    folder, plan, listed = BatchFolder(Location.of(out)), plan_of((), {}, COMMAND), entries(count)
-    folder.begin(plan, listed)
-    return work.WorkRequest(folder, plan, listed, work.WorkRules(**{"patience_s": 0.0, **rules}))  # type: ignore[arg-type]
+@pytest.fixture(autouse=True)
+def _no_pauses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(work, "WAITS_S", {code: (0.0,) * len(waits) for code, waits in work.WAITS_S.items()})
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # turns of this test alone
 
 
-def writes(unit: object, folder: WorkFolder) -> Ending:
-    folder.result.mkdir(parents=True, exist_ok=True)
-    (folder.result / "x.json").write_text(json.dumps({"value": unit.entry.source, "n": 7}))  # type: ignore[attr-defined]
-    return Ending(0, seconds=0.5, processor_s=0.25)
-
-
-def done_records(out: Path) -> dict[str, dict]:
-    return {path.stem: json.loads(path.read_text()) for path in sorted((out / "_batch/done").glob("*.json"))}
-
-
-def fail_with(code: int, times: int, counter: dict[str, int]):
-    def perform(unit, folder):
-        counter[unit.entry.name] = counter.get(unit.entry.name, 0) + 1
-        return Ending(code, "it broke", "error: it broke\n") if counter[unit.entry.name] <= times else writes(unit, folder)
-
-    return perform
+def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
 
 
 # ---- keys and lists -----------------------------------------------------------------------------------------------------
@@ -104,350 +131,262 @@ def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
         app.parse(words[3:])
 
 
-def test_a_scene_stays_in_its_shard_when_the_list_grows(tmp_path: Path) -> None:
-    names = [entry.name for entry in entries(200)]
+def test_a_scene_stays_in_its_shard_when_the_list_grows() -> None:
+    names = [f"scene{number}" for number in range(200)]
     counts = [sum(shard_of(name, 4) == i for name in names) for i in range(4)]
     assert sum(counts) == 200 and min(counts) > 20
-    assert all(shard_of(name, 12) % 4 == shard_of(name, 4) for name in names)  # lanes are shards of a finer division
 
 
 def test_sources_may_be_addresses(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_text("s3://bucket/logs/a revision=3\nlocal/b\n")
-    found = read_list(tmp_path / "list.txt", ("revision",))
-    assert [(e.name, e.source) for e in found] == [("a", "s3://bucket/logs/a"), ("b", str(tmp_path / "local/b"))]
+    listed = read_list(tmp_path / "list.txt", ("revision",))
+    assert [(e.name, e.source) for e in listed] == [("a", "s3://bucket/logs/a"), ("b", str(tmp_path / "local/b"))]
 
 
-# ---- claims -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("text", "environment", "wanted"),
+    [
+        ("", {}, (0, 1)),
+        ("2/5", {"JOB_COMPLETION_INDEX": "0"}, (2, 5)),
+        ("env", {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8"}, (3, 8)),
+        ("env", {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8", "SLURM_ARRAY_TASK_MIN": "1"}, (2, 8)),
+        ("env/5", {"JOB_COMPLETION_INDEX": "0"}, (0, 5)),
+        ("env", {"SKYPILOT_NODE_RANK": "1", "SKYPILOT_NUM_NODES": "4"}, (1, 4)),
+        ("env", {"AWS_BATCH_JOB_ARRAY_INDEX": "7", "AWS_BATCH_JOB_ARRAY_SIZE": "9"}, (7, 9)),
+    ],
+)  # fmt: skip
+def test_schedulers_number_the_shards(text: str, environment: Mapping[str, str], wanted: tuple[int, int]) -> None:
+    assert parse_shard(text, environment) == wanted
 
 
-def _race(folder: str, key: str, start: float, results: object) -> None:
-    time.sleep(max(0.0, start - time.time()))
-    found = claims.take(Location.of(folder), key, claims.Owner(f"w{os.getpid()}", "a machine of its own", 1), 60.0)
-    results.put(found.attempt if isinstance(found, claims.Claim) else 0)  # type: ignore[attr-defined]
+@pytest.mark.parametrize(
+    ("text", "environment"),
+    [("5/5", {}), ("a/b", {}), ("env", {}), ("env", {"JOB_COMPLETION_INDEX": "1"}), ("env/5", {"JOB_COMPLETION_INDEX": "5"}),
+     ("env/5", {"JOB_COMPLETION_INDEX": "x"})],
+)  # fmt: skip
+def test_what_is_no_shard_is_refused(text: str, environment: Mapping[str, str]) -> None:
+    with pytest.raises(UsageError, match="shard|numbered"):
+        parse_shard(text, environment)
 
 
-def test_of_eight_processes_one_gets_a_claim_and_one_an_expired_one(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
-    for key, first in (("fresh", 1), ("expired", 2)):
-        if key == "expired":
-            claims.take(Location.of(tmp_path), key, claims.Owner("gone", "another machine"), -1.0)
-        results = context.Queue()
-        start = time.time() + 0.3
-        racers = [context.Process(target=_race, args=(str(tmp_path), key, start, results)) for _ in range(8)]
-        for one in racers:
-            one.start()
-        won = [attempt for attempt in (results.get(timeout=30) for _ in racers) if attempt]
-        for one in racers:
-            one.join()
-        assert won == [first]
-
-
-def test_a_lease_is_kept_by_renewing_and_lost_to_the_next_attempt(tmp_path: Path) -> None:
-    place = Location.of(tmp_path)
-    mine = claims.take(place, "k", claims.Owner("me", "host one"), 0.2)
-    assert isinstance(mine, claims.Claim) and mine.attempt == 1
-    other = claims.Owner("you", "host two")
-    assert isinstance(claims.take(place, "k", other, 60.0), claims.Busy)
-    lost = threading.Event()
-    with claims.Heartbeat(mine, lost.set):
-        time.sleep(0.4)
-        assert isinstance(claims.take(place, "k", other, 60.0), claims.Busy)
-    time.sleep(0.25)
-    theirs = claims.take(place, "k", other, 60.0)
-    assert isinstance(theirs, claims.Claim) and theirs.attempt == 2 and theirs.counts == {retries.LOST: 1}
-    with claims.Heartbeat(mine, lost.set):
-        assert lost.wait(2.0)
-    assert not mine.renew() and mine.lost.is_set()
-
-
-def test_a_worker_that_died_on_this_machine_is_replaced_at_once(tmp_path: Path) -> None:
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    claims.take(Location.of(tmp_path), "k", claims.Owner("dead", process=dead.pid), 600.0)
-    found = claims.take(Location.of(tmp_path), "k", OWNER, 600.0)
-    assert isinstance(found, claims.Claim) and found.attempt == 2
-
-
-# ---- workers ------------------------------------------------------------------------------------------------------------
+# ---- scenes -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_second_run_does_nothing_and_any_order_gives_the_same(tmp_path: Path) -> None:
-    asked = request(tmp_path / "a", 6)
-    assert work.Worker(asked, perform=writes).run() == {"done": 6}
-    again = work.Worker(asked, perform=lambda *_: pytest.fail("nothing was to be done")).run()  # type: ignore[arg-type, return-value]
-    assert again == {}
-    backwards = request(tmp_path / "b", 6)
-    object.__setattr__(backwards, "entries", list(reversed(backwards.entries)))
-    work.Worker(backwards, perform=writes).run()
-    first, second = done_records(tmp_path / "a"), done_records(tmp_path / "b")
-    assert {key: one["digest"] for key, one in first.items()} == {key: one["digest"] for key, one in second.items()}
-    assert not list((tmp_path / "a/_batch/claims").iterdir()) and not list((tmp_path / "a/_batch/work").iterdir())
-    one = next(iter(first.values()))
-    assert (tmp_path / "a" / one["place"] / "x.json").is_file()
+    one, other = Scenes(tmp_path / "a", 6), Scenes(tmp_path / "b", 6)
+    assert one.run(jobs=3) == {"done": 6} and one.run() == {}
+    other.entries.reverse()
+    assert other.run() == {"done": 6}
+    assert one.digests() == other.digests() and set(one.runs().values()) == {1}
+    assert not list((tmp_path / "a/out/_batch/work").iterdir())
+    (record,) = (one for one in one.batch.records("done") if one.scene == "s3")
+    assert (tmp_path / "a/out" / record.place / "x.txt").read_text() == "result of s3\n"
 
 
 def test_an_output_of_another_batch_or_of_something_else_is_refused(tmp_path: Path) -> None:
-    asked = request(tmp_path / "a")
+    made = Scenes(tmp_path)
+    made.run()
     with pytest.raises(UsageError, match="other steps"):
-        asked.folder.begin(plan_of((), {}, (*COMMAND, "--more")), asked.entries)
-    asked.folder.begin(asked.plan, entries(5))  # a longer list is the same batch
-    assert len(asked.folder.entries()) == 5
+        made.batch.begin(plan_of((), {}, (*made.command, "--more")), made.entries)
+    made.batch.begin(made.plan, [*made.entries, Entry("more", "/logs/more")])  # a longer list is the same batch
+    assert made.batch.scenes() == ["more", "s0", "s1", "s2"]
     (tmp_path / "b").mkdir()
     (tmp_path / "b/photo.jpg").write_text("")
     with pytest.raises(UsageError, match="something else"):
-        BatchFolder(Location.of(tmp_path / "b")).begin(asked.plan, entries(1))
+        BatchFolder(Location.of(tmp_path / "b")).begin(made.plan, made.entries)
 
 
-@pytest.mark.parametrize(("code", "tries"), [(1, 1), (2, 1), (3, 1), (4, 2), (6, 1), (134, 3)])
+@pytest.mark.parametrize(("code", "tries"), [(1, 1), (2, 1), (3, 1), (4, 2), (5, 3), (6, 1), (134, 2), (143, 3)])
 def test_exit_codes_decide_how_often_a_step_is_tried(tmp_path: Path, code: int, tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retries, "backoff", lambda *_: 0.0)
-    counter: dict[str, int] = {}
-    asked = request(tmp_path, 1, patience_s=5.0)
-    counts = work.Worker(asked, perform=fail_with(code, 99, counter)).run()
-    assert counts == {"failed": 1} and counter == {"scene000": tries}
-    record = json.loads(next((tmp_path / "_batch/failed").iterdir()).read_text())
-    assert (record["code"], record["words"], record["attempt"]) == (code, "it broke", tries)
-    assert next((tmp_path / "_batch/logs").iterdir()).read_text() == "error: it broke\n"
+    monkeypatch.setattr(Stop, "sleep", lambda *_: None)
+    made = Scenes(tmp_path, 2)
+    made.does("s0", f"echo 'error: it broke' >&2; mkdir -p $2; echo x >> $2/left; exit {code}")
+    assert made.run() == {"failed": 1, "done": 1} and made.runs() == {"s0": tries, "s1": 1}
+    (record,) = made.batch.records("failed")
+    assert (record.code, record.words, record.scene) == (code, "it broke", "s0")
+    assert made.batch.log(record.key).load() == b"error: it broke\n"
+    made.does("s0", "")
+    assert made.run() == {}, "what has failed stays so"
+    assert batch.retry(str(made.batch.out), str(code))["forgotten"] == 1
+    assert made.run() == {"done": 1}
+    (path,) = (tmp_path / "out/s0/command").iterdir()
+    assert [file.name for file in path.iterdir()] == ["x.txt"], "nothing is left of the failure"
 
 
-def test_want_of_memory_waits_longer_on_the_machine_where_it_was_met(tmp_path: Path) -> None:
-    assert [retries.backoff(5, times, False) for times in (1, 2, 3)] == [60, 120, 240]
-    counter: dict[str, int] = {}
-    work.Worker(request(tmp_path, 1), perform=fail_with(5, 1, counter)).run()
-    place = Location.of(tmp_path / "_batch/claims")
-    key = next(iter((tmp_path / "_batch/claims").iterdir())).name.split(".")[0]
-    here, there = claims.take(place, key, OWNER, 60.0), claims.take(place, key, claims.Owner("x", "another machine"), 60.0)
-    assert isinstance(here, claims.Busy) and isinstance(there, claims.Busy)
-    assert here.until_s == pytest.approx(180, abs=5) and there.until_s == pytest.approx(60, abs=5)
-
-
-def test_what_a_killed_worker_left_is_gone_on_with(tmp_path: Path) -> None:
-    asked = request(tmp_path, 1)
-    unit = next(iter(asked.plan.units(asked.entries[0])))
-    claims.take(asked.folder.claims, unit.key, claims.Owner("gone", "another machine"), -1.0)
-    left = tmp_path / "_batch/work" / f"{unit.key}.1/result"
+def test_what_a_killed_driver_left_is_gone_on_with(tmp_path: Path) -> None:
+    made = Scenes(tmp_path, 1)
+    (unit,) = made.plan.units(made.entries[0])
+    left = tmp_path / "out/_batch/work" / f"{unit.key}.77-1/result"
     left.mkdir(parents=True)
     (left / "checkpoint").write_text("half")
     (left / "lock").write_text("{}")
-    seen = []
-
-    def resumes(unit, folder):
-        seen.append(((folder.result / "checkpoint").read_text(), (folder.result / "lock").exists(), left.exists()))
-        return writes(unit, folder)
-
-    assert work.Worker(asked, perform=resumes).run() == {"done": 1}
-    assert seen == [("half", False, False)]
+    made.does("s0", "[ -f $2/lock ] && exit 3; mv $2/checkpoint $2/seen")
+    assert made.run() == {"done": 1}
+    (result,) = (tmp_path / "out/s0/command").iterdir()
+    assert (result / "seen").read_text() == "half" and not list((tmp_path / "out/_batch/work").iterdir())
 
 
 def test_a_result_without_a_record_is_taken_as_it_is(tmp_path: Path) -> None:
-    """A worker that was cut off between publishing and recording."""
-    asked = request(tmp_path, 1)
-    work.Worker(asked, perform=writes).run()
-    (record,) = (tmp_path / "_batch/done").iterdir()
-    before = json.loads(record.read_text())["digest"]
+    """A driver that was cut off between publishing and recording."""
+    made = Scenes(tmp_path, 1)
+    made.run()
+    before, (record,) = made.digests(), (tmp_path / "out/_batch/done").iterdir()
     record.unlink()
-    assert work.Worker(asked, perform=lambda *_: Ending(1, "not again")).run() == {"done": 1}
-    assert json.loads(record.read_text())["digest"] == before
+    assert made.run() == {"done": 1} and made.digests() == before and made.runs() == {"s0": 1}
 
 
-def test_a_worker_that_lost_its_claim_records_nothing(tmp_path: Path) -> None:
-    asked = request(tmp_path, 1)
-
-    def overtaken(unit, folder):
-        (tmp_path / "_batch/claims" / f"{unit.key}.2.json").write_text(json.dumps({"state": "working", "until": time.time() + 60}))
-        return writes(unit, folder)
-
-    assert work.Worker(asked, perform=overtaken).run() == {}
-    assert not done_records(tmp_path) and not (tmp_path / "_batch/failed").exists()
-
-
-def test_bounds_reject_a_result_with_its_number(tmp_path: Path) -> None:
-    asked = request(tmp_path, 1, bounds=quality.parse_bounds(["x.json:n>=8", "x.json:missing>=1"]))
-    assert work.Worker(asked, perform=writes).run() == {"rejected": 1}
-    found = status.read_status(asked.folder)
-    (failure,) = found.failures.values()
-    assert (failure.code, failure.words, failure.state) == (retries.REJECTED, "x.json:n>=8: it is 7", "rejected")
-    assert batch.retry(str(tmp_path), "quality")["forgotten"] == 1
-    with pytest.raises(InputError, match="nothing failed"):
-        batch.retry(str(tmp_path), "5")
+def test_a_slow_attempt_that_another_took_over_publishes_nothing(tmp_path: Path) -> None:
+    """As on a node that only seemed to be lost: the other attempt took its folder, and its result stays."""
+    made, other = Scenes(tmp_path, 1), Scenes(tmp_path, 1)
+    made.does("s0", f"touch {tmp_path}/up; while [ ! -f {tmp_path}/go ]; do sleep 0.05; done")
+    slow = threading.Thread(target=made.run)
+    slow.start()
+    wait_for((tmp_path / "up").exists)
+    made.does("s0", "")
+    assert other.run() == {"done": 1}
+    before = other.digests()
+    (tmp_path / "go").touch()
+    slow.join(30)
+    assert other.digests() == before and len(list((tmp_path / "out/s0/command").iterdir())) == 1
 
 
-def test_bounds_read_scores(tmp_path: Path) -> None:
-    rows = [{"method": "mudg_s", "distance_m": 3.0, "values": {"psnr": 17.5, "fid": "not computed"}}]
-    (tmp_path / "score").mkdir()
-    (tmp_path / "score/metrics.json").write_text(json.dumps({"by_distance": rows}))
-    low, high, other = quality.parse_bounds(["mudg_s.psnr@3>=18", "mudg_s.psnr@3<=18", "mudg_s.fid@3<=1"])
-    assert low.problem(tmp_path) == "mudg_s.psnr@3>=18: it is 17.5"
-    assert high.problem(tmp_path) == "" and other.problem(tmp_path) == ""
-    for bad in ("psnr>=1", "a.b>1", "a.b>=x", "../x.json:n>=1", "a.b>=inf"):
-        with pytest.raises(UsageError):
-            quality.parse_bounds([bad])
+def test_a_killed_step_is_tried_again_alone_and_with_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Stop, "sleep", lambda *_: None)
+    made, order = Scenes(tmp_path, 2), tmp_path / "order"
+    made.does("s0", f'[ $MUDG_THREADS -gt 1 ] && kill -9 $$; echo a >> {order}; sleep 0.3; echo a >> {order}')
+    made.does("s1", f"while [ $(wc -l < {tmp_path}/tally/s0.runs) -lt 1 ]; do sleep 0.02; done; sleep 0.5; echo b >> {order}")
+    assert made.run(jobs=2, threads=4) == {"done": 2} and made.runs() == {"s0": 2, "s1": 1}
+    assert "".join(order.read_text().split()) == "baa", "the second try waited for the other step"
+    made.entries.append(Entry("s2", "/logs/2"))
+    made.does("s2", "kill -9 $$")
+    assert made.run(threads=4) == {"failed": 1}
+    assert "also alone" in next(made.batch.records("failed")).words
 
 
-def test_a_second_run_that_differs_is_a_failure(tmp_path: Path) -> None:
-    same = request(tmp_path / "same", 1, second_share=1.0)
-    assert work.Worker(same, perform=writes).run() == {"done": 1}
-    assert status.read_status(same.folder).events == {"second": 1, "different": 0}
-    calls = []
-
-    def differs(unit, folder):
-        calls.append(1)
-        ending = writes(unit, folder)
-        (folder.result / "x.json").write_text(str(len(calls)))
-        return ending
-
-    assert work.Worker(request(tmp_path / "other", 1, second_share=1.0), perform=differs).run() == {"failed": 1}
-    assert sum(quality.is_sampled(f"{n:032x}", 0.1) for n in range(2000)) == pytest.approx(200, abs=50)
+def test_too_few_programs_and_processes(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such program"):
+        run_step(["/no/such/program", "mudg"], tmp_path, 1, Stop())
+    made = Scenes(tmp_path, 1)
+    made.does("s0", "exit 0")
+    assert made.run() == {"failed": 1}
+    assert next(made.batch.records("failed")).words == "it ended well but wrote nothing"
 
 
-def test_too_many_failures_stop_a_batch(tmp_path: Path) -> None:
-    worker = work.Worker(request(tmp_path, 20, most_failures="10%"), perform=lambda *_: Ending(3, "bad"))
-    assert worker.run() == {"failed": 3} and worker.gave_up
-    assert work.limit_of("5%", 1000) == 50 and work.limit_of("7", 1000) == 7
+# ---- drivers ------------------------------------------------------------------------------------------------------------
 
 
-# ---- status and costs -----------------------------------------------------------------------------------------------------
+def test_two_drivers_on_one_output_are_refused(tmp_path: Path) -> None:
+    folder = BatchFolder(Location.of(tmp_path))
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        with folder.owned() as mine:
+            alive = json.loads(mine.load()) | {"process": child.pid}
+            mine.save(json.dumps(alive).encode())
+        for shard in ((0, 1), (1, 3)):
+            with pytest.raises(UsageError, match="another driver works"), folder.owned(shard):
+                pass
+    finally:
+        child.kill()
+        child.wait()
+    with folder.owned():  # dead, on this machine
+        pass
+    assert not list((tmp_path / "_batch").iterdir())
+
+
+def test_shards_have_drivers_of_their_own(tmp_path: Path) -> None:
+    folder, elsewhere = BatchFolder(Location.of(tmp_path)), {"host": "elsewhere", "process": 1, "since": 1.0}
+    (tmp_path / "_batch").mkdir()
+    (tmp_path / "_batch/owner-1-of-3.json").write_text(json.dumps({**elsewhere, "shard": [1, 3]}))
+    with folder.owned((0, 3)):
+        assert len(folder.owners()) == 2
+    for refused in ((1, 3), (0, 1), (0, 2)):
+        with pytest.raises(UsageError, match="another machine may still") as caught, folder.owned(refused):
+            pass
+        assert "--take-over" in caught.value.remedy
+    with folder.owned((1, 3), numbered=True):  # the scheduler runs every number once
+        assert next(iter(folder.owners().values())).host == this_host()
+    (tmp_path / "_batch/owner.json").write_text(json.dumps(elsewhere))
+    with folder.owned(take_over=True):
+        assert [one.host.split()[0] for one in folder.owners().values()] == [socket.gethostname()]
+
+
+def test_two_drivers_that_begin_at_the_same_moment(tmp_path: Path) -> None:
+    """Of eight processes at most one drives at a time."""
+    code = """
+import sys, time
+from pathlib import Path
+from mudg.base.errors import UsageError
+from mudg.base.location import Location
+from mudg.stages.batches.records import BatchFolder
+start, out = Path(sys.argv[1]), Path(sys.argv[2])
+(out.parent / ("ready" + sys.argv[3])).touch()
+while not start.exists():
+    time.sleep(0.001)
+try:
+    with BatchFolder(Location.of(out)).owned():
+        time.sleep(1.0)
+        print("mine")
+except UsageError as error:
+    print("refused", error.what)
+"""
+    words = [sys.executable, "-c", code, str(tmp_path / "start"), str(tmp_path / "out")]
+    racers = [subprocess.Popen([*words, str(number)], stdout=subprocess.PIPE, text=True) for number in range(4)]
+    wait_for(lambda: len(list(tmp_path.glob("ready*"))) == 4)
+    (tmp_path / "start").touch()
+    answers = [one.communicate()[0].split()[0] for one in racers]
+    assert answers.count("mine") <= 1 and set(answers) <= {"mine", "refused"}
+
+
+# ---- status -------------------------------------------------------------------------------------------------------------
 
 
 def test_status_counts_groups_and_forecasts(tmp_path: Path) -> None:
-    asked = request(tmp_path, 6)
-
-    def some(unit, folder):
-        return Ending(3, f"it is cut off; {unit.entry.source}") if unit.entry.name < "scene002" else writes(unit, folder)
-
-    work.Worker(asked, perform=some).run()
-    found = status.read_status(asked.folder)
-    figures = found.stages["command"]
-    assert (figures.done, figures.failed, found.finished_scenes, found.left()) == (4, 2, 4, 0)
-    assert [(words, count) for words, count, _ in found.reasons()] == [("3 bad input: it is cut off", 2)]
-    assert figures.seconds == pytest.approx(2.0)
-    for file in (tmp_path / "_batch/events").iterdir():  # events may be lost with a worker; the records tell the same
-        file.unlink()
-    again = status.read_status(asked.folder)
-    assert again.stages["command"].done == 4 and again.stages["command"].seconds == pytest.approx(2.0)
-    assert again.reasons() == found.reasons()
-    asked.folder.begin(asked.plan, entries(10))
-    longer = status.read_status(asked.folder)
-    assert longer.left() == 4
-    cost = costs.costs_of(longer, 3600.0, 0.0)
-    assert cost["stages"]["command"]["core_hours"] == pytest.approx(1.0 / 3600, abs=1e-4)
-    assert cost["total"]["money_left"] == pytest.approx(1.0, rel=0.01)
-    assert "scenes" in costs.text_of(cost) and "cut off" in status.text_of(found)
-    page = status.page_of(found)
-    assert "it is cut off" in page and "<script" not in page
+    made = Scenes(tmp_path, 6)
+    for name in ("s0", "s1"):
+        made.does(name, f"echo 'error: it is cut off' >&2; echo '  where: {name}' >&2; exit 3")
+    made.run()
+    state = status.read_status(made.batch, price=2.0)
+    assert (state.stages["command"].done, state.stages["command"].failed, state.finished, state.steps_left()) == (4, 2, 4, 0)
+    assert [(words, count) for words, count, _ in state.reasons()] == [("3 bad input: it is cut off", 2)]
+    for record in (tmp_path / "out/_batch/done").iterdir():
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"processor_s": 900.0, "lost_s": 900.0, "ended": 1000.0}))
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"ended": 1030.0}))
+    for failed in made.batch.keys("failed"):
+        made.batch.record("failed", failed).remove()
+    made.batch.begin(made.plan, [*made.entries, Entry("more", "/logs/more")])
+    state = status.read_status(made.batch, price=2.0)
+    assert state.steps_left() == 3 and state.forecast_s() == pytest.approx(30.0)  # 3 further ends in 30 s
+    assert state.costs()["total"] == {"core_hours": 2.0, "lost_hours": 1.0, "core_hours_left": 1.5, "money": 4.0, "money_left": 3.0}
+    assert "cost at 2" in status.text_of(state) and json.dumps(state.record())
 
 
-def test_status_escapes_what_others_wrote(tmp_path: Path) -> None:
-    asked = request(tmp_path, 1)
-    work.Worker(asked, perform=lambda *_: Ending(3, "<img src=x onerror=alert(1)>")).run()
-    assert "<img" not in status.page_of(status.read_status(asked.folder))
-    with (tmp_path / "_batch/events/other.jsonl").open("w") as handle:
-        handle.write('{"event": "done", "key": "forged"}\n[1]\n{"cut')
-    assert status.read_status(asked.folder).stages["command"].done == 0
+def test_pages_escape_what_others_wrote(tmp_path: Path) -> None:
+    made = Scenes(tmp_path, 1)
+    made.does("s0", "echo 'error: <img src=x onerror=alert(1)>' >&2; exit 3")
+    made.run()
+    page = status.page_of(status.read_status(made.batch))
+    assert "<img" not in page and "onerror=alert(1)" in page and "<script" not in page
 
 
 def test_facts_are_summed_over_the_logs(tmp_path: Path) -> None:
     poses = [[1, 0, 0, x, 0, 1, 0, y, 0, 0, 1, 0] for x, y in ((0, 0), (3, 4), (3, 10))]
     ego = {"times_s": [0.0, 1.0, 1.5], "world_from_ego": poses}
+    (tmp_path / "log").mkdir()
     scene = {"frames": [1, 2], "cameras": {"front": {}}, "ego": ego, "source": {"dataset": "kitti"}}
-    (tmp_path / "scene.json").write_text(json.dumps(scene))
-    (tmp_path / "tracks.json").write_text(json.dumps({"tracks": [{"label": "car"}, {"label": "car"}]}))
+    (tmp_path / "log/scene.json").write_text(json.dumps(scene))
+    (tmp_path / "log/tracks.json").write_text(json.dumps({"tracks": [{"label": "car"}, {"label": "car"}]}))
     facts = {"dataset": "kitti", "cameras": 1, "images": 2, "seconds": 1.5, "metres": 11.0, "objects": {"car": 2}}
-    assert quality.facts_of(tmp_path) == facts
-    folder, plan = BatchFolder(Location.of(tmp_path / "out")), BatchPlan((BatchStage("ingest", COMMAND),))
-    folder.begin(plan, entries(3))
-
-    def copies(unit, folder):
-        shutil.copytree(tmp_path, folder.result, ignore=shutil.ignore_patterns("out"))
-        return Ending(0)
-
-    work.Worker(work.WorkRequest(folder, plan, entries(3)), perform=copies).run()
-    found = status.read_status(folder)
-    corpus = found.record()["corpus"]
+    found = facts_of(tmp_path / "log")
+    assert found is not None and found.model_dump() == facts
+    made = Scenes(tmp_path)
+    copy = BatchStage("command", ("cp", "-r", str(tmp_path / "log"), "{out}"))
+    made.plan = BatchPlan((copy,))
+    made.run()
+    for record in (tmp_path / "out/_batch/done").iterdir():
+        record.write_text(record.read_text().replace('"stage": "command"', '"stage": "ingest"'))
+    (tmp_path / "out/_batch/plan.json").write_text('{"stages": [{"name": "ingest"}]}')
+    corpus = status.read_status(made.batch).corpus()
     assert (corpus["scenes"], corpus["images"], corpus["kilometres"], corpus["objects"]) == (3, 6, 0.033, {"car": 6})
-    assert "Kilometres driven" in status.page_of(found)
-
-
-# ---- engines ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("environment", "shards", "wanted"),
-    [
-        ({"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8"}, 1, (3, 8)),
-        ({"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "8", "SLURM_ARRAY_TASK_MIN": "1"}, 1, (2, 8)),
-        ({"JOB_COMPLETION_INDEX": "0"}, 5, (0, 5)),
-        ({"SKYPILOT_NODE_RANK": "1", "SKYPILOT_NUM_NODES": "4"}, 1, (1, 4)),
-        ({"AWS_BATCH_JOB_ARRAY_INDEX": "7"}, 9, (7, 9)),
-    ],
-)
-def test_schedulers_number_the_shards(environment: dict[str, str], shards: int, wanted: tuple[int, int]) -> None:
-    assert engines.shard_of_environment(shards, environment) == wanted
-
-
-@pytest.mark.parametrize("environment", [{}, {"JOB_COMPLETION_INDEX": "5"}, {"JOB_COMPLETION_INDEX": "x"}])
-def test_numbers_that_are_no_shard_are_refused(environment: dict[str, str]) -> None:
-    with pytest.raises(UsageError):
-        engines.shard_of_environment(5, environment)
-
-
-SCRIPT = """#!/bin/bash
-#SBATCH --job-name=mudg-batch
-#SBATCH --array=0-7%2
-#SBATCH --requeue
-#SBATCH --open-mode=append
-#SBATCH --signal=B:USR1@120
-#SBATCH --output=/runs/_batch/slurm/%A_%a.txt
-#SBATCH --partition=gpu
-#SBATCH --gres=gpu:1
-
-cd '/my folder' || exit 2
-pass_on() { kill -TERM "$child" 2>/dev/null; }
-trap pass_on USR1 TERM
-mudg batch run --list 'a b.txt' &
-child=$!
-wait "$child"
-while kill -0 "$child" 2>/dev/null; do wait "$child"; done
-wait "$child"  # one that a signal cut short does not say how the task ended
-code=$?
-if [ "$code" -eq 143 ]; then
-  scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}" && sleep 60
-fi
-exit "$code"
-"""
-
-
-def test_the_slurm_script() -> None:
-    words = ("mudg", "batch", "run", "--list", "a b.txt")
-    job = slurm.SlurmJob(words, 8, "/my folder", "/runs/_batch/slurm/%A_%a.txt", 100.0, 2, ("partition=gpu", "gres=gpu:1"))
-    assert slurm.script_of(job) == SCRIPT
-    for bad in ("array=0-3", "time=1\n#SBATCH --wrap=x", "--partition=gpu"):
-        with pytest.raises(UsageError):
-            slurm.script_of(slurm.SlurmJob(words, 8, "/", "/o", 1.0, 0, (bad,)))
-    words = ["batch", "run", "--engine", "slurm", "--shards=8", "--wait", "--list", "l"]
-    assert slurm.task_words(words, 8)[3:] == ("batch", "run", "--list", "l", "--engine", "env", "--shards", "8", "--quiet")
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
-def test_the_slurm_script_forwards_the_signal_and_asks_to_be_queued_again(tmp_path: Path) -> None:
-    (tmp_path / "bin").mkdir()
-    (tmp_path / "bin/scontrol").write_text(f"#!/bin/sh\necho \"$@\" >> {tmp_path}/requeued\nexit 1\n")
-    (tmp_path / "bin/scontrol").chmod(0o755)
-    child = f"import signal,sys,time; signal.signal(15, lambda *_: sys.exit(143)); open({str(tmp_path / 'up')!r},'w'); time.sleep(30)"
-    job = slurm.SlurmJob((sys.executable, "-c", child), 1, str(tmp_path), "/o", 1.0)
-    environment = {**os.environ, "PATH": f"{tmp_path}/bin:{os.environ['PATH']}", "SLURM_ARRAY_JOB_ID": "9", "SLURM_ARRAY_TASK_ID": "4"}
-    process = subprocess.Popen(["bash", "-c", slurm.script_of(job)], env=environment)
-    wait_for(tmp_path / "up")
-    process.send_signal(signal.SIGUSR1)
-    assert process.wait(20) == 143
-    assert (tmp_path / "requeued").read_text() == "requeue 9_4\n"
-
-
-def wait_for(path: Path, seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < end, f"{path} did not come"
-        time.sleep(0.02)
 
 
 # ---- processes ----------------------------------------------------------------------------------------------------------
@@ -469,41 +408,103 @@ open(os.path.join(out, "whole"), "w").write("whole")
 """
 
 
-def test_sigterm_leads_to_a_checkpoint_and_the_same_command_goes_on(tmp_path: Path) -> None:
-    (tmp_path / "step.py").write_text(CHECKPOINTS)
-    (tmp_path / "list.txt").write_text("city name=one\n")
-    words = [sys.executable, "-m", "mudg", "batch", "run", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"),
-             "--jobs", "1", "--quiet", "--command", sys.executable, str(tmp_path / "step.py"), "{out}", str(tmp_path / "up")]  # fmt: skip
-    process = subprocess.Popen(words)
-    wait_for(tmp_path / "up", 60)
+
+def start(made: Scenes, *more: str) -> subprocess.Popen[bytes]:
+    made.command = (sys.executable, str(made.folder / "step.py"), "{out}", str(made.folder / "up"))
+    (made.folder / "step.py").write_text(CHECKPOINTS)
+    process = subprocess.Popen([sys.executable, "-m", "mudg", *made.words("--jobs", "1", *more)])
+    wait_for((made.folder / "up").exists)
+    return process
+
+
+@pytest.mark.parametrize("scratch", [False, True])
+def test_sigterm_leads_to_a_checkpoint_and_the_same_command_goes_on(scratch: bool, tmp_path: Path) -> None:
+    made = Scenes(tmp_path, 1)
+    more = ("--scratch", str(tmp_path / "one")) if scratch else ()
+    process = start(made, *more)
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) == 143
-    (claim,) = (tmp_path / "out/_batch/claims").iterdir()
-    assert json.loads(claim.read_text())["counts"] == {"143": 1}
-    assert next((tmp_path / "out/_batch/work").iterdir()).name.endswith(".left")
+    assert not list((tmp_path / "out/_batch").glob("owner*")) and not (tmp_path / "out/_batch/failed").exists()
     (tmp_path / "up").unlink()
-    assert app.main(words[3:]) == 0
-    assert not (tmp_path / "up").exists()
-    (record,) = done_records(tmp_path / "out").values()
-    assert record["attempt"] == 2 and (tmp_path / "out" / record["place"] / "whole").is_file()
+    shutil.rmtree(tmp_path / "one", ignore_errors=True)  # on another machine, a stopped worker's checkpoint is there, too
+    assert app.main(made.words("--jobs", "1", *more)) == 0
+    assert not (tmp_path / "up").exists(), "it began from nothing"
+    (record,) = made.batch.records("done")
+    assert (tmp_path / "out" / record.place / "whole").is_file() and not list((tmp_path / "out/_batch").glob("partial/*"))
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="no setpriv")
-def test_a_killed_worker_leaves_no_orphan(tmp_path: Path) -> None:
-    (tmp_path / "step.py").write_text(CHECKPOINTS)
-    (tmp_path / "list.txt").write_text("city name=one\n")
-    words = ["batch", "run", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"), "--jobs", "1", "--quiet",
-             "--command", sys.executable, str(tmp_path / "step.py"), "{out}", str(tmp_path / "up")]  # fmt: skip
-    process = subprocess.Popen([sys.executable, "-m", "mudg", *words])
-    wait_for(tmp_path / "up", 60)
-    time.sleep(0.1)
+def test_a_killed_driver_leaves_no_orphan_and_is_taken_over(tmp_path: Path) -> None:
+    made = Scenes(tmp_path, 1)
+    process = start(made)
+    wait_for(lambda: (tmp_path / "up").read_text())
     child = int((tmp_path / "up").read_text())
     process.kill()
     process.wait()
-    end = time.monotonic() + 10
-    while Path(f"/proc/{child}").exists() and "State:\tZ" not in Path(f"/proc/{child}/status").read_text():
-        assert time.monotonic() < end, "the step outlived its worker"
-        time.sleep(0.05)
+    gone = lambda: not Path(f"/proc/{child}").exists() or "State:\tZ" in Path(f"/proc/{child}/status").read_text()  # noqa: E731
+    wait_for(gone, 10)
+    (work_dir,) = (tmp_path / "out/_batch/work").iterdir()
+    (work_dir / "result/half").write_text("half")
+    assert app.main(made.words("--jobs", "1")) == 0
+
+
+def test_a_slurm_task_stops_for_its_checkpoint(tmp_path: Path) -> None:
+    """What submitit calls when the job is about to end."""
+    pytest.importorskip("submitit")
+    made = Scenes(tmp_path, 2)
+    made.does("s0", f"trap 'touch {tmp_path}/stopped; exit 143' TERM; touch {tmp_path}/up; while :; do sleep 0.05; done")
+    made.batch.begin(made.plan, made.entries)
+    task = engines.SlurmTask(Job(made.batch, made.plan, grace_s=20.0), made.entries)
+    answers = []
+    thread = threading.Thread(target=lambda: answers.append(task.checkpoint()))
+
+    def announce() -> None:
+        wait_for((tmp_path / "up").exists)
+        thread.start()
+
+    threading.Thread(target=announce).start()
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        assert task() == {"stopped": 1} and (tmp_path / "stopped").exists()
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    thread.join()
+    made.does("s0", "")
+    try:
+        assert answers[0].function() == {"done": 2}
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.mark.slow
+def test_submitit_runs_the_tasks(tmp_path: Path) -> None:
+    """Its executor for this machine pickles and starts a task as that for Slurm does."""
+    submitit = pytest.importorskip("submitit")
+    made = Scenes(tmp_path, 3)
+    made.batch.begin(made.plan, made.entries)
+    executor = submitit.LocalExecutor(tmp_path / "jobs")
+    executor.update_parameters(timeout_min=5)
+    task = executor.submit(engines.SlurmTask(Job(made.batch, made.plan), made.entries))
+    assert task.result() == {"done": 3}
+    Scenes(tmp_path / "b").run()
+    assert made.digests() == {one.scene: one.digest for one in BatchFolder(Location.of(tmp_path / "b/out")).records("done")}
+
+
+@pytest.mark.parametrize("option", ["array=0-3", "time=1\n#SBATCH --wrap=x", "--partition=gpu", ""])
+def test_options_that_are_none_for_slurm(option: str, tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    made = Scenes(tmp_path, 1)
+    for options in ((option, "time=3"), ("partition=gpu",)):
+        with pytest.raises(UsageError, match="slurm-options"):
+            engines.submit_to_slurm(Job(made.batch, made.plan), made.entries, BatchConfig(slurm_options=options))
+
+
+def test_a_machine_without_slurm_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    made = Scenes(tmp_path, 1)
+    with pytest.raises(ResourceError, match="another --engine"):
+        engines.submit_to_slurm(Job(made.batch, made.plan), made.entries, BatchConfig(slurm_options=("time=3",)))
 
 
 def test_last_words() -> None:
@@ -518,12 +519,32 @@ def test_the_command_line_says_what_is_missing(tmp_path: Path, capsys: pytest.Ca
     assert app.main(["batch", "run", "--out", str(tmp_path / "o")]) == 2
     (tmp_path / "list.txt").write_text("city\n")
     words = ["batch", "run", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "o")]
-    assert app.main([*words, "--max-failures", "many"]) == 2
+    assert app.main([*words, "--shard", "3"]) == 2
+    assert app.main([*words, "--shard", "0/3", "--engine", "ray"]) == 2
     assert app.main([*words, "--set", "fit.iterationz=3"]) == 2
     assert "did you mean fit.iterations" in capsys.readouterr().err
     assert app.main([*words, "--stages", "ingest", "fuse", "--dry-run"]) == 0
     assert "1 scenes: ingest -> fuse" in capsys.readouterr().out
     assert not (tmp_path / "o").exists()
+
+
+def test_failures_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = Scenes(tmp_path, 4)
+    made.does("s1", "echo 'error: no camera' >&2; exit 3")
+    assert app.main(made.words("--jobs", "2")) == 11
+    assert app.main(made.words("--jobs", "2")) == 0, "nothing was left to do"
+    capsys.readouterr()
+    assert app.main(["batch", "status", str(tmp_path / "out"), "--html", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["reasons"] == [{"reason": "3 bad input: no camera", "steps": 1, "example": "s1 command"}]
+    assert "no camera" in (tmp_path / "out/status.html").read_text()
+    assert app.main(["batch", "retry", str(tmp_path / "out"), "--reason", "5"]) == 3
+    assert app.main(["batch", "retry", str(tmp_path / "out"), "--reason", "memory"]) == 2
+    made.does("s1", "")
+    assert app.main(["batch", "retry", str(tmp_path / "out"), "--reason", "5,3"]) == 0
+    assert app.main(made.words()) == 0 and made.runs() == {"s0": 1, "s1": 2, "s2": 1, "s3": 1}
+    with pytest.raises(InputError, match="no batch"):
+        batch.retry(str(tmp_path / "elsewhere"))
 
 
 def test_paths_in_settings_are_made_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -587,8 +608,8 @@ def test_templates_follow_their_schemas_and_start_a_batch() -> None:
     spec = job["spec"]
     pod, (container,) = spec["template"]["spec"], spec["template"]["spec"]["containers"]
     words = [*container["command"], *container["args"]]
-    parsed = app.parse(words[1:])
-    assert parsed.settings.engine == "env" and parsed.settings.shards == spec["completions"]
+    parsed, _ = app.parse(words[1:])
+    assert parsed.shard == f"env/{spec['completions']}"
     assert pod["terminationGracePeriodSeconds"] > parsed.settings.grace_s
     rules = [rule["onExitCodes"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule]
     assert {rule["containerName"] for rule in rules} == {container["name"]}
@@ -596,93 +617,5 @@ def test_templates_follow_their_schemas_and_start_a_batch() -> None:
     task = yaml.safe_load((EXAMPLES / "batch_skypilot.yaml").read_text())
     assert differs(task, SKYPILOT) == []
     line = next(line for line in task["run"].splitlines() if line.startswith("mudg"))
-    assert app.parse(line.split()[1:]).settings.engine == "env"
+    assert app.parse(line.split()[1:])[0].shard == "env"
     assert differs({"a": 1, "c": "x"}, {"a": str, "b": int}) == [".c", ".b is missing", ".a: 1"]
-
-
-# ---- object stores ------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def bucket() -> Location:
-    fsspec = pytest.importorskip("fsspec")
-    fsspec.filesystem("memory").store.clear()
-    return Location.of("memory://bucket/runs")
-
-
-def remote_request(out: Location, scratch: Path, count: int = 2) -> work.WorkRequest:
-    folder, plan, listed = BatchFolder(out), plan_of((), {}, COMMAND), entries(count)
-    folder.begin(plan, listed)
-    return work.WorkRequest(folder, plan, listed, work.WorkRules(patience_s=0.0, scratch=scratch))
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_results_in_an_object_store(bucket: Location, tmp_path: Path) -> None:
-    asked = remote_request(bucket, tmp_path)
-    assert work.Worker(asked, perform=writes).run() == {"done": 2}
-    for unit in (unit for entry in asked.entries for unit in asked.plan.units(entry)):
-        record = json.loads(asked.folder.done(unit.key).load())
-        assert json.loads((bucket / record["place"] / "x.json").load())["n"] == 7
-    assert status.read_status(asked.folder).stages["command"].done == 2
-    assert work.Worker(asked, perform=lambda *_: pytest.fail("again")).run() == {}  # type: ignore[arg-type, return-value]
-    assert not list((tmp_path / "mudg_batch").iterdir()) and asked.folder.claims.names() == []
-
-
-def test_a_checkpoint_goes_to_the_next_machine(bucket: Location, tmp_path: Path) -> None:
-    asked = remote_request(bucket, tmp_path / "one", 1)
-
-    def stopped(unit, folder):
-        folder.result.mkdir(parents=True)
-        (folder.result / "half").write_text("half")
-        worker.stop()
-        return Ending(143)
-
-    worker = work.Worker(asked, perform=stopped)
-    assert worker.run() == {} and worker.stopped
-    seen = []
-
-    def resumes(unit, folder):
-        seen.append((folder.result / "half").read_text())
-        return writes(unit, folder)
-
-    elsewhere = remote_request(bucket, tmp_path / "two", 1)
-    assert work.Worker(elsewhere, perform=resumes).run() == {"done": 1}
-    assert seen == ["half"] and (asked.folder.own / "partial").names() == []
-
-
-def test_an_upload_that_fails_for_a_moment_costs_no_second_run(
-    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(work, "_PUBLISH_WAITS_S", (0.0, 0.0))
-    tries, runs, publish = [], [], WorkFolder.publish
-
-    def fails_twice(self: WorkFolder, read_later: bool = False) -> None:
-        tries.append(1)
-        if len(tries) <= 2:
-            raise ResourceError("no connection")
-        publish(self, read_later)
-
-    def counted(unit, folder):
-        runs.append(1)
-        return writes(unit, folder)
-
-    monkeypatch.setattr(WorkFolder, "publish", fails_twice)
-    assert work.Worker(remote_request(bucket, tmp_path, 1), perform=counted).run() == {"done": 1}
-    assert (len(tries), len(runs)) == (3, 1)
-
-
-def test_a_full_scratch_disk_is_tried_again_and_emptied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retries, "backoff", lambda *_: 0.0)
-    asked = request(tmp_path / "out", 1, scratch=tmp_path / "scratch", patience_s=5.0)
-    runs = []
-
-    def full(unit, folder):
-        runs.append(list((tmp_path / "scratch/mudg_batch").iterdir()))
-        if len(runs) < 3:
-            folder.result.mkdir(parents=True)
-            raise OSError(28, "No space left on device")
-        return writes(unit, folder)
-
-    assert work.Worker(asked, perform=full).run() == {"done": 1}
-    assert [len(there) for there in runs] == [1, 1, 1]
-    assert not list((tmp_path / "scratch/mudg_batch").iterdir())

@@ -22,7 +22,6 @@ from mudg.data.observations import read_image_file
 from mudg.data.scene import labels
 from mudg.data.scene.read import check_image, decode_image
 from mudg.report import gallery
-from mudg.stages.batches import review
 from mudg.stages.scoring.detections import read_mask
 
 CAMERA = Camera("front", 60_000, 60_000, 100.0, 100.0, 30_000.0, 30_000.0)
@@ -72,4 +71,3 @@ def test_pages_leave_out_an_image_that_claims_to_be_huge(kind: Callable[[str], b
     (tmp_path / "x.png").write_bytes(kind("RGB"))
     with at_most(512):
         assert gallery._thumbnail(tmp_path / "x.png", 100) == ""
-        assert review.small_picture(tmp_path / "x.png") == b""

@@ -45,7 +45,7 @@ from mudg.stages import (
     synthesize,
 )
 from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.lists import Entry
+from mudg.stages.batches.plan import Entry
 from mudg.stages.config import (
     AnnotateConfig,
     BenchConfig,

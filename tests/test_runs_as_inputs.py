@@ -150,8 +150,9 @@ def test_help_all_works_for_every_verb(verb: str) -> None:
 @pytest.mark.parametrize(
     ("page", "shown", "others"),
     [
-        ("batch status", ("--html", "--watch-s"), ("--stages", "--preset", "--price", "--reason")),
-        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--watch-s", "--reason")),
+        ("batch status", ("--html", "--watch-s", "--price"), ("--stages", "--preset", "--reason", "--shard")),
+        ("batch retry", ("--reason",), ("--stages", "--html", "--price")),
+        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--watch-s", "--reason", "--price")),
         ("bench paper", ("--table", "--iterations"), ("--protocols", "--sampler", "--variant")),
         ("bench mdm", ("--steps", "--cities"), ("--table", "--protocols", "--score.width-px")),
         ("bench real", ("--protocols", "--variant", "--ablation"), ("--table", "--videos", "--sampler")),

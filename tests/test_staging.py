@@ -98,7 +98,7 @@ def test_a_finished_result_is_reused_and_another_refused(command: Callable[..., 
     assert code == 0 and at("memory://bucket/fused/run.json").load() != before
 
 
-@pytest.mark.parametrize("fails", ["put_file", "pipe_file", "cat_file"])
+@pytest.mark.parametrize("fails", ["put_file", "pipe_file", "get_file"])
 def test_stopped_in_a_transfer_the_same_command_goes_on(
     fails: str, command: Callable[..., Any], scratch: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,11 +23,10 @@ from pathlib import Path
 import pytest
 
 from mudg import app
-from mudg.base import remote, store
-from mudg.base.errors import InputError, ResourceError
+from mudg.base import location, store
+from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
-from mudg.stages.batches import claims
-from mudg.stages.batches.folders import BatchFolder
+from mudg.stages.batches.records import BatchFolder
 
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # warnings of the servers' own packages
 
@@ -41,13 +40,12 @@ def server(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
         pytest.skip(f"no {request.param} server: run tools/storage_tests.sh")
     use(SERVERS[request.param], monkeypatch)
     yield request.param
-    remote._opened.cache_clear()
+    location._file_system.cache_clear()
 
 
 def use(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", address)
-    remote._opened.cache_clear()
-    remote._exclusive.clear()
+    location._file_system.cache_clear()
 
 
 @pytest.fixture
@@ -72,15 +70,16 @@ def content(folder: Path) -> dict[str, str]:
     }
 
 
-def test_single_objects(root: Location, server: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_single_objects(root: Location, server: str) -> None:
     assert root.names() == [] and not root.exists()
     assert (root / "b/one").save(b"1") and (root / "b/one").save(b"12") and (root / "a").save(b"")
-    assert (root / "b/one").load() == b"12" and (root / "b/one").size() == 2 and (root / "a").load() == b""
-    assert root.names() == ["a", "b"]
+    assert (root / "b/one").load() == b"12" and (root / "a").load() == b""
+    assert root.names() == ["a", "b"] and root.tree() == {"a": 0, "b/one": 2}
+    assert root.load_below(["a", "gone"]) == {"a": b""}
     claim = root / "claim"
-    assert claim.save(b"first", only_if_absent=True) and not claim.save(b"second", only_if_absent=True)
-    assert claim.load() == b"first" and claim.exclusive() == CONDITIONAL[server]
-    assert ("no conditional writes" in capfd.readouterr().err) != CONDITIONAL[server]
+    assert claim.save(b"first", only_if_absent=True)
+    if CONDITIONAL[server]:
+        assert not claim.save(b"second", only_if_absent=True) and claim.load() == b"first"
     claim.remove()
     claim.remove()
     with pytest.raises(InputError, match="nothing is at"):
@@ -91,7 +90,6 @@ def test_single_objects(root: Location, server: str, capfd: pytest.CaptureFixtur
 def test_of_eight_threads_one_makes_each_object(root: Location, server: str) -> None:
     if not CONDITIONAL[server]:
         pytest.skip("this server has no conditional writes")
-    assert (root / "warm").exclusive()
     ready = threading.Barrier(8)
 
     def claim(me: int) -> list[int]:
@@ -105,7 +103,7 @@ def test_of_eight_threads_one_makes_each_object(root: Location, server: str) -> 
 
 
 def test_folders_with_large_objects_and_odd_names(root: Location, tmp_path: Path) -> None:
-    made = folder_of(tmp_path, 0, 1, 3 << 20, remote.PIECE, 2 * remote.PIECE, 2 * remote.PIECE + 1, 40 << 20)
+    made = folder_of(tmp_path, 0, 1, 3 << 20, 8 << 20, (16 << 20) + 1, 40 << 20)
     (root / "run").push(made)
     (root / "run").fetch(tmp_path / "back")
     assert content(tmp_path / "back") == content(made)
@@ -123,7 +121,7 @@ def test_more_objects_than_one_page_of_a_listing(root: Location) -> None:
 PUSH = "import sys; from pathlib import Path; from mudg.base.location import Location; Location.of(sys.argv[1]).push(Path(sys.argv[2]))"
 
 
-def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path, server: str) -> None:
+def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path) -> None:
     made = folder_of(tmp_path, *[1 << 20] * 60)
     child = subprocess.Popen([sys.executable, "-c", PUSH, str(root / "run"), str(made)], stderr=subprocess.DEVNULL)
     end = time.monotonic() + 60
@@ -137,44 +135,35 @@ def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path
     there = set((root / "run/part0").names())
     assert there
     sent: list[str] = []
-    put = remote.RemoteStore.put
+    put = Location._put
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(remote.RemoteStore, "put", lambda self, path, *more: sent.append(path) or put(self, path, *more))
+        patch.setattr(Location, "_put", lambda self, frm, names: sent.extend(names) or put(self, frm, names))
         (root / "run").push(made)
-    if server == "moto":  # keeps the sha256 that was sent with an object
-        assert len(sent) <= 60 - len(there)
+    assert len(sent) <= 60 - len(there)
     (root / "run").fetch(tmp_path / "back")
     assert content(tmp_path / "back") == content(made)
 
 
-def test_uploads_that_fail_now_and_then_arrive(root: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every seventh request of the client is answered with a failure that passes."""
-    monkeypatch.setattr(remote, "FIRST_WAIT_S", 0.01)
-    files = type(root.side.storage.files)
-    found, lock, count = files._call_s3, threading.Lock(), [0]
-
-    async def failing(self, *args, **options):  # type: ignore[no-untyped-def]
-        with lock:
-            count[0] += 1
-            number = count[0]
-        if number % 7 == 0:
-            raise ConnectionResetError("injected")
-        return await found(self, *args, **options)
-
-    monkeypatch.setattr(files, "_call_s3", failing)
+def test_a_store_that_fails_now_and_then(root: Location, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every seventh request refused, every eleventh answer lost: what the store's own package repeats is enough."""
     made = folder_of(tmp_path, *[1000] * 20, 20 << 20)
-    (root / "run").push(made)
-    (root / "run").fetch(tmp_path / "back")
-    assert content(tmp_path / "back") == content(made) and count[0] > 60
+    with unreliable(SERVERS[server]) as (address, handler):
+        use(address, monkeypatch)
+        (root / "run").push(made)
+        (root / "run").fetch(tmp_path / "back")
+        print(f"{server}: {handler.count} requests, {handler.count // 7} refused, {handler.count // 11} answers lost")
+        assert content(tmp_path / "back") == content(made) and handler.count > 60
+        use(SERVERS[server], monkeypatch)
 
 
 def test_failures_in_words(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="no such bucket"):
         Location.of("s3://missing-bucket/x").save(b"1")
-    monkeypatch.setattr(remote, "FIRST_WAIT_S", 0.0)
     use("http://127.0.0.1:9", monkeypatch)
-    with pytest.raises(ResourceError, match=r"cannot be reached[\s\S]*tried 6 times"):
+    began = time.monotonic()
+    with pytest.raises(ResourceError, match="cannot be reached"):
         Location.of("s3://bucket/x").load()
+    print(f"no server: told after {time.monotonic() - began:.0f} s")
     if server == "rclone":  # moto takes any key
         use(SERVERS[server], monkeypatch)
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong-secret-key")
@@ -309,51 +298,36 @@ ELSEWHERE = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 """Starts a program where process numbers mean something else, as on another machine."""
 
 
-def test_a_batch_whose_list_logs_claims_and_results_lie_in_a_store(
-    root: Location, server: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_batch_whose_list_logs_and_results_lie_in_a_store(root: Location, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     if subprocess.run([*ELSEWHERE, "true"], check=False, capture_output=True).returncode:
         pytest.skip("no process spaces of its own for this user (unshare --pid)")
     made = BatchInAStore(root, tmp_path, 6)
     (made.root / "logs/s03").remove()
     (tmp_path / "logs/s03/log.txt").unlink()
     made.put_log("s03", "")
-    lease_s = 4.0
-    lease = ("--lease-s", str(lease_s), "--patience-s", "40")
-    first = made.start("one", *lease, before=ELSEWHERE, STEP_S="2")
+    first = made.start("one", before=ELSEWHERE, STEP_S="2")
     wait_until(lambda: sum(made.runs().values()) >= 2, 60)
     first.kill()
     first.wait()
-    killed = time.time()
     begun = made.runs()
-    assert made.start("two", *lease).wait(120) == 11
-    taken = [one for one in BatchFolder(made.out).events() if one["event"] == "began" and one["attempt"] > 1]
-    assert len(taken) == 1, "the scene of the worker that was killed"
-    with capfd.disabled():
-        print(f"{server}: taken over {taken[0]['at'] - killed:.1f} s after the kill, lease {lease_s:.0f} s")
-    assert 0 < taken[0]["at"] - killed < lease_s + 5
+    assert made.start("two").wait(120) == 2, "the other machine may still be at it"
+    assert made.start("two", "--take-over").wait(120) == 11
     capfd.readouterr()
     assert app.main(["batch", "status", str(made.out), "--html", "--json"]) == 0
-    found = json.loads(capfd.readouterr().out)
-    assert (found["finished"], found["left"], found["stages"]["command"]["failed"]) == (5, 0, 1)
-    assert (
-        found["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
-    )
-    assert app.main(["batch", "cost", str(made.out), "--price", "1"]) == 0
+    record = json.loads(capfd.readouterr().out)
+    assert (record["finished"], record["left"], record["stages"]["command"]["failed"]) == (5, 0, 1)
+    assert record["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
     made.put_log("s03", "text of s03\n")
     assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0
-    assert made.start("three", *lease).wait(120) == 0
+    assert made.start("three").wait(120) == 0
     assert made.results() == {name: f"text of {name}\n" for name in made.names}
     once = {name for name, count in made.runs().items() if count == 1}
     assert set(made.names) - once <= {"s03", *begun} and sum(made.runs().values()) <= made.scenes + 2
-    assert (made.out / "_batch").names() == ["done", "events", "list." + hashed(made), "logs", "plan.json"]
-    assert not list((tmp_path / "two/mudg_batch").iterdir()) and not list((tmp_path / "three/mudg_batch").iterdir())
-
-
-def hashed(made: BatchInAStore) -> str:
-    """The end of the name of the list's record: there is one, for all three machines read the same list."""
-    (name,) = (one for one in (made.out / "_batch").names() if one.startswith("list."))
-    return name.removeprefix("list.")
+    names = (made.out / "_batch").names()
+    assert [name for name in names if not name.startswith("list.")] == ["done", "logs", "plan.json"] and len(names) == 4
+    for machine in ("two", "three"):
+        assert not list((tmp_path / machine / "mudg_batch").iterdir())
+        assert not [path for path in (tmp_path / machine / "mudg_inputs").rglob("*") if path.suffix != ".lock"]
 
 
 class _Unreliable(http.server.BaseHTTPRequestHandler):
@@ -417,37 +391,39 @@ def unreliable(address: str) -> Iterator[tuple[str, type[_Unreliable]]]:
             here.shutdown()
 
 
-def test_two_workers_and_a_store_that_fails_now_and_then(root: Location, server: str, tmp_path: Path) -> None:
+def test_two_shards_and_a_store_that_fails_now_and_then(root: Location, server: str, tmp_path: Path) -> None:
     made = BatchInAStore(root, tmp_path, 8)
     with unreliable(SERVERS[server]) as (address, handler):
         variables = {"AWS_ENDPOINT_URL": address, "STEP_S": "0.2"}
-        both = [
-            made.start(
-                f"machine{index}", "--engine", "env", "--shards", "2", JOB_COMPLETION_INDEX=str(index), **variables
-            )
-            for index in range(2)
-        ]
+        both = [made.start(f"machine{i}", "--shard", "env/2", JOB_COMPLETION_INDEX=str(i), **variables) for i in range(2)]
         assert [one.wait(300) for one in both] == [0, 0]
         print(f"{server}: {handler.count} requests, {handler.count // 7} refused, {handler.count // 11} answers lost")
         assert handler.count > 100
     assert made.results() == {name: f"text of {name}\n" for name in made.names}
-    assert sum(made.runs().values()) == 8 and (made.out / "_batch/claims").names() == []
+    assert sum(made.runs().values()) == 8
 
 
-def test_of_six_claims_one_stands_where_nobody_is_excluded_almost_always(root: Location, server: str) -> None:
-    """All look, all write; the last one to write keeps the claim."""
-    claims_there = root / "claims"
-    assert claims_there.exclusive() == CONDITIONAL[server]
-    ready = threading.Barrier(6)
+def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> None:
+    ready, driving, most = threading.Barrier(6), [0], [0]
 
-    def race(me: int) -> int:
-        owner = claims.Owner(f"worker {me}", "a machine of its own", me)
+    def race(me: int) -> str:
         ready.wait()
-        return sum(isinstance(claims.take(claims_there, f"key{n}", owner, 60.0), claims.Claim) for n in range(5))
+        try:
+            with BatchFolder(root / "runs").owned():
+                driving[0] += 1
+                most[0] = max(most[0], driving[0])
+                time.sleep(3.0)
+                driving[0] -= 1
+                return "mine"
+        except UsageError:
+            return "refused"
 
-    with concurrent.futures.ThreadPoolExecutor(6) as pool:
-        won = sum(pool.map(race, range(6)))
-    assert won == 5 if CONDITIONAL[server] else 5 <= won <= 7  # one that was slow to write may come too late
+    # threads of one process take each other for dead; as other machines do, they must not
+    with pytest.MonkeyPatch.context() as patch, concurrent.futures.ThreadPoolExecutor(6) as pool:
+        patch.setattr("mudg.stages.batches.records.this_host", lambda: f"host {threading.get_ident()}")
+        answers = list(pool.map(race, range(6)))
+    if CONDITIONAL[server]:
+        assert answers.count("mine") <= 1 and most[0] <= 1
 
 
 def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ fi
 if [ ! -x "$folder/venv/bin/ray" ]; then
     mkdir -p "$folder"
     "$python" -m venv "$folder/venv"
-    "$folder/venv/bin/pip" install -q 'ray>=2.40'
+    "$folder/venv/bin/pip" install -q 'ray>=2.40' 'submitit>=1.5'
 fi
 "$python" -c 'import site; print(*site.getsitepackages(), sep="\n")' >"$(echo "$folder"/venv/lib/python3*/site-packages)/zz_mudg.pth"
 cd "$root"

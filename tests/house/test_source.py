@@ -125,11 +125,11 @@ def refuse(problems: list[str]) -> None:
 
 CONNECTS = {
     "socket", "ssl", "urllib.request", "http", "ftplib", "smtplib", "poplib", "imaplib", "telnetlib", "xmlrpc", "asyncio", "requests",
-    "httpx", "aiohttp", "websockets", "paramiko", "fsspec", "s3fs", "gcsfs", "adlfs", "ray", "torch.distributed",
+    "httpx", "aiohttp", "websockets", "paramiko", "fsspec", "s3fs", "gcsfs", "adlfs", "ray", "submitit", "torch.distributed",
     "torch.hub",
 }  # fmt: skip
 CONNECTING = {
-    "base/remote.py": {"fsspec", "ssl"}, "stages/batches/on_ray.py": {"ray"}, "stages/learning/parallel.py": {"torch.distributed"},
+    "base/location.py": {"fsspec", "ssl"}, "stages/batches/engines.py": {"ray", "submitit"}, "stages/learning/parallel.py": {"torch.distributed"},
     "stages/viewing/server.py": {"http"}, "stages/viewing/view.py": {"http"},
 }  # fmt: skip
 """Modules that may reach a network, and what of. SECURITY.md tells when they do."""

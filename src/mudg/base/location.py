@@ -1,33 +1,216 @@
-"""A place where data lies: a path on this machine, or an address in an object store. The same calls for both.
+"""A path on this machine, or an address in an object store behind fsspec (S3, Google Cloud, Azure): the same calls for both.
 
     runs = Location.of("s3://bucket/runs")
-    runs.names()                                                ['kitti', 'city']
-    (runs / "_claims" / "kitti.json").save(b"...", only_if_absent=True)
-    (runs / "kitti").fetch(Path("/scratch/kitti"))              staged in, verified
-    (runs / "kitti").push(Path("/scratch/kitti"))               uploaded, its manifest last
+    runs.names()                                    ['city', 'kitti']
+    (runs / "kitti").fetch(Path("/scratch/kitti"))  staged in; every file's SHA-256 is compared
+    (runs / "kitti").push(Path("/scratch/kitti"))   uploaded; the manifest is written last
 
-Reads see an old complete file or a new complete one. A folder is a result when its manifest is there; ``push`` writes that last.
+An uploaded folder holds ``_contents.json``: size and SHA-256 of every file, and whether all have arrived. That record alone says what a
+result is. Requests that fail are repeated by the store's own package. Credentials come from the environment, where that package looks
+for them; an address that holds some is refused and never shown.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
 import re
-from dataclasses import dataclass
-from pathlib import Path
+import shutil
+import ssl
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
 
-from mudg.base import store, transfer
-from mudg.base.errors import InputError, UsageError
-from mudg.base.local import LocalStore
-from mudg.base.remote import PACKAGES, PROBE, RemoteStore, checked_address, scheme_of
+from mudg.base import log, memory, store
+from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
 from mudg.base.run_folder import is_temporary
 
+PACKAGES: Final[Mapping[str, tuple[str, str]]] = {
+    "s3": ("s3fs", "s3"), "s3a": ("s3fs", "s3"), "gs": ("gcsfs", "gs"), "gcs": ("gcsfs", "gs"), "abfs": ("adlfs", "abfs"),
+    "abfss": ("adlfs", "abfs"), "az": ("adlfs", "abfs"), "memory": ("fsspec", "s3"),
+}  # fmt: skip
+"""Scheme of an address -> the package that reads it, and the extra of this program that installs it."""
+CONTENTS: Final = "_contents.json"
+_FILES_AT_ONCE: Final = 8
+_CHUNK: Final = 8 << 20
+"""Bytes of one part of a large upload; S3 takes 10,000 parts."""
+_LEFT_FREE: Final = 64 << 20
 _FLATTENED = re.compile(rf"({'|'.join(PACKAGES)}|file):/(?!/)")
+
+
+def scheme_of(text: str) -> str:
+    """``s3`` of ``s3://bucket/x``; empty for a path on this machine."""
+    match = re.match(r"([A-Za-z][A-Za-z0-9+.\-]+)://", text)
+    return match[1].lower() if match else ""
+
+
+def checked_address(text: str) -> str:
+    """An address in its one spelling: no slash at the end, none doubled.
+
+    Raises:
+        UsageError: an unknown scheme, no bucket, credentials or a query in it (which are not shown), or ``..``.
+    """
+    scheme = scheme_of(text)
+    rest = text[len(scheme) + 3 :]
+    if scheme not in PACKAGES:
+        known = ", ".join(f"{one}://" for one in PACKAGES)
+        raise UsageError("no storage of this kind is known", where=f"{scheme}://", expected=f"a path, or one of {known}")
+    head, _, tail = rest.partition("/")
+    if ("@" in head and PACKAGES[scheme][0] != "adlfs") or ":" in head:  # Azure: container@account; a password may hold a slash
+        raise UsageError("an address holds a user or a password", where=f"{scheme}://...", remedy="leave them out and set "
+            "the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")  # fmt: skip
+    if "?" in rest:
+        raise UsageError("an address holds a query, which may be a secret", where=f"{scheme}://{head.partition('?')[0]}/...",
+            expected=f"{scheme}://bucket/folder", remedy="leave the part from ? on out")  # fmt: skip
+    parts = [part for part in tail.split("/") if part]
+    if ".." in parts or "." in parts or "\0" in rest or "::" in head:
+        raise UsageError("an address is not plain", where=text[:200].replace("\0", "?"), expected=f"{scheme}://bucket/folder")
+    if not head and scheme != "memory":
+        raise UsageError("an address names no bucket", where=text[:200], expected=f"{scheme}://bucket/folder")
+    return f"{scheme}://" + "/".join(part for part in (head, *parts) if part)
+
+
+@functools.cache
+def _file_system(scheme: str, process: int) -> Any:
+    """The file system of a scheme: one for each process, for a connection does not survive a fork."""
+    package, extra = PACKAGES[scheme]
+    options: dict[str, Any] = {} if scheme == "memory" else {"use_listings_cache": False, "skip_instance_cache": True}
+    if package == "s3fs":
+        limits = {"connect_timeout": 10, "read_timeout": 60, "retries": {"total_max_attempts": 2}}  # s3fs itself repeats five times
+        options |= {"max_concurrency": 1, "config_kwargs": limits}
+    try:
+        import fsspec
+
+        return fsspec.filesystem(scheme, **options)
+    except ImportError as error:
+        raise ResourceError(f"a package for {scheme}:// is missing", expected=package, got=str(error).split("\n")[0],
+            remedy=f"pip install 'mudg[{extra}]'") from error  # fmt: skip
+
+
+# failures in words ----------------------------------------------------------------------------------------------------
+
+_WORDS: Final[Mapping[str, tuple[str, str]]] = {
+    "connection": ("a storage server cannot be reached",
+        "check the network and the server's address (S3: AWS_ENDPOINT_URL), then repeat the command to resume"),
+    "busy": ("a storage server does not answer as it should", "repeat the command later to resume"),
+    "refused": ("a storage server refused access", "check which account the environment names and what it may do there"),
+    "credentials": ("no credentials for a storage server",
+        "set them in the environment (S3: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE)"),
+    "certificate": ("a storage server's certificate is not trusted", "check the address, or set AWS_CA_BUNDLE"),
+    "request": ("a storage server cannot do what was asked", "check the address: the bucket's name, its region, the server's kind"),
+}  # fmt: skip
+_CREDENTIALS: Final = re.compile(r"Credential|TokenRetrieval|UnauthorizedSSO|ProfileNotFound|ClientAuthentication")
+_CONNECTION: Final = re.compile(r"Connect|Timeout|ClientPayload|ClientOSError|HTTPClientError|IncompleteRead|ServiceRe")
+
+
+def kind_of(error: BaseException) -> str:
+    """A key of the table of words above; empty for an error that does not speak of a store."""
+    chain, status = [error], 0
+    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
+        chain.append(cause)
+    for one in chain:
+        answer = getattr(one, "response", None)
+        codes = [answer.get("ResponseMetadata", {}).get("HTTPStatusCode")] if isinstance(answer, Mapping) else []
+        codes += [getattr(one, name, None) for name in ("status", "status_code", "code")]
+        status = status or next((code for code in codes if isinstance(code, int) and 400 <= code < 600), 0)
+    if any(isinstance(one, ssl.SSLCertVerificationError) for one in chain):
+        return "certificate"
+    if any(_CREDENTIALS.search(type(one).__name__) for one in chain):
+        return "credentials"
+    if status in (401, 403) or isinstance(error, PermissionError):
+        return "refused"
+    if status:
+        return "busy" if status in (408, 409, 425, 429) or status >= 500 else "request"
+    if any(isinstance(one, ConnectionError | TimeoutError) or _CONNECTION.search(type(one).__name__) for one in chain):
+        return "connection"
+    return ""
+
+
+def without_secrets(text: str) -> str:
+    """A message without the values of the environment's secrets."""
+    for name, value in os.environ.items():
+        if len(value) >= 6 and re.search(r"SECRET|TOKEN|PASSWORD|ACCESS_KEY|ACCOUNT_KEY|CONNECTION_STRING|SAS", name):
+            text = text.replace(value, "***")
+    return re.sub(r"//[^/\s@]+:[^/\s@]+@", "//***@", text)
+
+
+@contextlib.contextmanager
+def _in_words(doing: str, where: str, missing: str = "") -> Iterator[None]:
+    """Failures of a store's package as ResourceError. missing: what is wrong where the store says that nothing is there."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        if missing:
+            raise InputError(missing, where=where, got=without_secrets(str(error))[:200]) from error
+        raise
+    except (FileExistsError, IsADirectoryError):
+        raise
+    except Exception as error:
+        kind = kind_of(error)
+        if not kind:
+            raise
+        what, remedy = _WORDS[kind]
+        text = without_secrets(" ".join(str(error).split()))[:300] or type(error).__name__
+        raise ResourceError(what, where=where, got=f"{doing}: {text}", remedy=remedy) from error
+
+
+_NO_BUCKET: Final = "there is no such bucket, or it is not reachable for this account"
+
+
+# records of uploads ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a file should be. sha256: empty if not known."""
+
+    size: int
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Upload:
+    """What ``_contents.json`` says. files: of one under way: those that are there, or may be."""
+
+    complete: bool
+    files: Mapping[str, Expected] = field(default_factory=dict)
+
+    def content(self) -> bytes:
+        """The record as it is stored."""
+        files = {name: {"bytes": one.size, "sha256": one.sha256} for name, one in sorted(self.files.items())}
+        return store.json_text({"schema": 1, "state": "complete" if self.complete else "uploading", "files": files}, indent=None).encode()
+
+
+def _plain(name: str, where: str) -> str:
+    """A name that stays below its folder, or IntegrityError: what lies in a store may be anybody's."""
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or (os.name == "nt" and ":" in name):
+        raise IntegrityError("a name leads out of its folder", where=where, got=repr(name)[:200])
+    return name
+
+
+def _files_below(folder: Path) -> list[str]:
+    """Relative POSIX names of all regular files, sorted, without temporary ones and locks."""
+    names = []
+    for top, _, files in os.walk(folder):
+        for name in files:
+            relative = (Path(top).relative_to(folder) / name).as_posix()
+            if name not in ("lock", CONTENTS) and ".part" not in relative and (folder / relative).is_file():
+                names.append(relative)
+    return sorted(names)
+
+
+# locations ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Location:
-    """A file or folder on this machine, or in an object store (``s3://bucket/folder``). Made by ``Location.of``."""
+    """A file or folder on this machine, or in an object store. Made by ``Location.of``.
+
+    Every method raises ResourceError where the store or the disk fails.
+    """
 
     text: str
     """The path, or the address in its one spelling. It never holds credentials."""
@@ -54,14 +237,11 @@ class Location:
             if host not in ("", "localhost"):
                 raise UsageError("a file address names another machine", where=text[:200], expected="file:///folder")
             text, scheme = unquote(f"/{path}"), ""
-        if not scheme:
-            return cls(os.path.normpath(text))
-        return cls(checked_address(text))
+        return cls(checked_address(text) if scheme else os.path.normpath(text))
 
     def __truediv__(self, name: str) -> Location:
         """What lies below, by a relative name."""
-        parts = name.split("/")
-        if not name or any(part in ("", ".", "..") for part in parts) or "\0" in name:
+        if not name or any(part in ("", ".", "..") for part in name.split("/")) or "\0" in name:
             raise UsageError("not a name below a folder", where=self.text, got=repr(name)[:200])
         return Location(f"{self.text.rstrip('/') if self.local is not None else self.text}/{name}")
 
@@ -79,93 +259,278 @@ class Location:
         return self.text.rstrip("/").rpartition("/")[2]
 
     @property
-    def _store(self) -> LocalStore | RemoteStore:
-        return RemoteStore(scheme_of(self.text)) if self.local is None else LocalStore()
+    def _files(self) -> Any:
+        return _file_system(scheme_of(self.text), os.getpid())
 
     @property
     def _path(self) -> str:
-        return self.text if self.local is not None else self.text.partition("://")[2]
+        return self.text.partition("://")[2]
 
-    @property
-    def side(self) -> transfer.Side:
-        """For transfers."""
-        return transfer.Side(self._store, self._path)
+    # single files ------------------------------------------------------------------------------------------------------
+
+    def _kind(self) -> str:
+        """``file``, ``directory``, or empty where nothing is."""
+        if self.local is not None:
+            return "directory" if self.local.is_dir() else "file" if self.local.exists() else ""
+        with contextlib.suppress(FileNotFoundError), _in_words("looking it up", self.text):
+            return str(self._files.info(self._path)["type"])
+        return ""
 
     def exists(self) -> bool:
         """Whether a file, or a folder with something in it, is there."""
-        return self._store.exists(self._path)
-
-    def size(self) -> int:
-        """Bytes of a file. InputError: none is there."""
-        try:
-            return self._store.size(self._path)
-        except FileNotFoundError as error:
-            raise self._missing() from error
+        return self._kind() != ""
 
     def load(self) -> bytes:
         """The content of a file. InputError: none is there."""
+        missing = "nothing is at this address; check it, and whether its upload was finished"
         try:
-            return self._store.load(self._path)
-        except (FileNotFoundError, IsADirectoryError) as error:
-            raise self._missing() from error
+            with _in_words("reading", self.text, missing):
+                return store.read_bytes(self.local) if self.local is not None else bytes(self._files.cat_file(self._path))
+        except IsADirectoryError as error:
+            raise InputError("a folder is where a file should be", where=self.text) from error
 
-    def _missing(self) -> InputError:
-        return InputError("nothing is at this address", where=self.text, remedy="check it, and whether its upload was finished")
+    def load_below(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Contents of files right below, of a store many at a time; one that was removed meanwhile is left out."""
+        if self.local is not None:
+            found = {}
+            for name in names:
+                with contextlib.suppress(InputError):
+                    found[name] = store.read_bytes(self.local / name)
+            return found
+        paths = {f"{self._path}/{name}": name for name in names}
+        with _in_words("reading", self.text):
+            answers = self._files.cat(list(paths), on_error="return") if paths else {}
+        return {paths[path.lstrip("/")]: content for path, content in answers.items() if isinstance(content, bytes)}
 
     def save(self, data: bytes, *, only_if_absent: bool = False) -> bool:
         """Write a file completely or not at all.
 
         Args:
-            only_if_absent: write only where nothing is. Of several that do so at once one gets True, if ``exclusive()``.
+            only_if_absent: write only where nothing is. Of several that do so at once one gets True, if the store honours conditional
+                writes (S3: ``If-None-Match``).
 
         Returns:
             False if ``only_if_absent`` and somebody else made the file.
         """
-        if only_if_absent:
-            return self._store.create(self._path, data)
-        self._store.save(self._path, data)
+        if self.local is not None:
+            if only_if_absent:
+                return store.create_once(self.local, data)
+            store.atomic_write(self.local, data)
+            return True
+        try:
+            with _in_words("writing", self.text, _NO_BUCKET):
+                self._files.pipe_file(self._path, data, **({"mode": "create"} if only_if_absent else {}))
+        except FileExistsError:
+            return self.load() == data  # the answer to the first try may have been lost
         return True
-
-    def exclusive(self) -> bool:
-        """Whether ``only_if_absent`` holds here against others at the same moment. A store is tried out once, and said aloud if not."""
-        return self._store.exclusive(self._path)
 
     def remove(self) -> None:
         """Remove a file, or a folder with all below it, its manifest first. Nothing there is no error."""
-        at = self._store
-        if not at.is_folder(self._path) or os.path.islink(self._path):
-            at.remove(self._path)
+        if self._kind() == "directory" and not (self.local is not None and self.local.is_symlink()):
+            if "/" not in (self._path or self.text).strip("/"):
+                raise UsageError("a whole bucket or disk is not removed", where=self.text)
+            (self / store.MANIFEST).remove()
+            if self.local is not None:
+                with store.disk_errors("cannot remove a folder", self.local, "check who may write there"):
+                    shutil.rmtree(self.local)
+                return
+        elif self.local is not None:
+            store.remove(self.local)
             return
-        if "/" not in self._path.strip("/"):
-            raise UsageError("a whole bucket or disk is not removed", where=self.text)
-        at.remove(f"{self._path}/{store.MANIFEST}")
-        at.remove_tree(self._path)
+        with contextlib.suppress(FileNotFoundError), _in_words("removing", self.text):
+            self._files.rm(self._path, recursive=True)
 
     def names(self) -> list[str]:
         """Names of what lies right below, sorted, without temporary files; empty where nothing is."""
-        found = self._store.names(self._path)
-        return sorted(name for name in found if not is_temporary(name) and not name.startswith(PROBE))
+        if self.local is not None:
+            below = os.listdir(self.local) if self.local.is_dir() else []
+        else:
+            below = []
+            with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
+                below = [str(path).strip("/").rpartition("/")[2] for path in self._files.ls(self._path, detail=False)
+                    if str(path).strip("/") != self._path]  # fmt: skip
+        return sorted(name for name in below if name and not is_temporary(name))
 
-    def fetch(self, to: Path) -> None:
-        """Stage a file or folder in. What an earlier, interrupted fetch left at ``to`` is used again.
+    def tree(self) -> dict[str, int]:
+        """Sizes of all files below in bytes, by relative name."""
+        if self.local is not None:
+            return {name: (self.local / name).stat().st_size for name in _files_below(self.local)}
+        with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
+            found = {str(path).strip("/"): facts for path, facts in self._files.find(self._path, detail=True).items()}
+            head = f"{self._path}/"
+            sizes = {path[len(head) :]: int(facts.get("size") or 0) for path, facts in found.items() if path.startswith(head)}
+            return {name: size for name, size in sorted(sizes.items()) if name and name != CONTENTS}
+        return {}
+
+    # folders -----------------------------------------------------------------------------------------------------------
+
+    def uploaded(self) -> Upload | None:
+        """The record of an upload to this folder; None where there is none. IntegrityError: it is damaged."""
+        record = self / CONTENTS
+        if not record.exists():
+            return None
+        try:
+            values = store.parse_json(record.load(), str(record))
+            files = {str(name): Expected(int(entry["bytes"]), str(entry["sha256"])) for name, entry in values["files"].items()}
+            complete = values["state"] == "complete"
+        except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
+            raise IntegrityError("the record of an upload is damaged", where=str(record), got=str(error).split("\n")[0],
+                remedy="upload the folder again, to another address") from error  # fmt: skip
+        return Upload(complete, {_plain(name, str(record)): one for name, one in files.items()})
+
+    def fetch(self, to: Path, *, mirror: bool = False) -> None:
+        """Stage a file or folder in. Files that an earlier, interrupted fetch brought are used again.
+
+        Args:
+            mirror: remove files below ``to`` that are not part of the folder: those of an earlier version.
 
         Raises:
             InputError: nothing is there, or its upload was not finished. IntegrityError: what came is not what was uploaded.
-            ResourceError: no connection, or the disk is full.
         """
-        if not self.exists():
-            raise self._missing()
-        transfer.fetch(self.side, Path(to))
+        to, kind = Path(to), self._kind()
+        if not kind:
+            raise InputError("nothing is at this address", where=self.text, remedy="check it, and whether its upload was finished")
+        wanted = self._wanted() if kind == "directory" else {"": Expected(self._size())}
+        missing = [name for name, one in wanted.items() if not _is_here(to / name if name else to, one)]
+        missing.sort(key=lambda name: (PurePosixPath(name).name in (store.MANIFEST, store.RUN_STATE), name))
+        self._require_space(to, sum(wanted[name].size for name in missing))
+        store.make_folder(to if kind == "directory" else to.parent)
+        with log.task(f"fetching {self}", len(missing)) as bar:
+            for names in _grouped(missing, 4 * _FILES_AT_ONCE):
+                parts = {name: _part(to / name if name else to) for name in names}
+                self._get(parts)
+                for name, part in parts.items():
+                    _verify(part, wanted[name], f"{self}/{name}" if name else self.text)
+                    store.take_place(part, to / name if name else to)
+                    bar.advance()
+        if mirror and kind == "directory":
+            for path in [path for path in to.rglob("*") if not path.is_dir() and path.relative_to(to).as_posix() not in wanted]:
+                store.remove(path)
+
+    def _size(self) -> int:
+        with _in_words("looking it up", self.text):
+            return self.local.stat().st_size if self.local is not None else int(self._files.info(self._path)["size"] or 0)
+
+    def _wanted(self) -> dict[str, Expected]:
+        record, sizes = self.uploaded(), self.tree()
+        if record is not None:
+            if not record.complete or (store.MANIFEST in record.files and store.MANIFEST not in sizes):
+                raise InputError("an upload was not finished", where=self.text, remedy="repeat the command that makes it: it resumes")
+            absent = sorted(set(record.files) - set(sizes))
+            if absent:
+                raise IntegrityError("a file is missing", where=f"{self}/{absent[0]}")
+            return dict(record.files)
+        wanted = {_plain(name, self.text): Expected(size) for name, size in sizes.items()}
+        for manifest in [name for name in wanted if PurePosixPath(name).name == store.MANIFEST]:
+            record_there = store.parse_json((self / manifest).load(), f"{self}/{manifest}")
+            files = record_there.get("files") if isinstance(record_there, dict) else None
+            for name, entry in (files if isinstance(files, dict) else {}).items():
+                full = str(PurePosixPath(manifest).parent / str(name))
+                if isinstance(entry, dict) and "sha256" in entry:
+                    if full not in sizes:
+                        raise IntegrityError("a file is missing", where=f"{self}/{full}")
+                    wanted[full] = Expected(sizes[full], str(entry["sha256"]))
+        return wanted
+
+    def _require_space(self, to: Path, missing: int) -> None:
+        at = next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())
+        free = shutil.disk_usage(at).free
+        if missing + _LEFT_FREE > free:
+            raise ResourceError("not enough space to fetch data", where=str(to), expected=f"{memory.in_words(missing)} for {self}",
+                got=f"{memory.in_words(free)} free", remedy="free disk space, or choose a folder on a larger disk (--scratch)")  # fmt: skip
+
+    def _get(self, parts: Mapping[str, Path]) -> None:
+        if self.local is not None:
+            for name, part in parts.items():
+                store.copy_in_tree(self.local / name if name else self.local, part)
+            return
+        for part in parts.values():
+            store.make_folder(part.parent)
+        sources = [f"{self._path}/{name}" if name else self._path for name in parts]
+        with _in_words("fetching", self.text, "a file was removed while it was fetched"):
+            self._files.get(sources, [str(part) for part in parts.values()], batch_size=_FILES_AT_ONCE)
 
     def push(self, frm: Path) -> None:
-        """Upload a folder: all files, several at a time, its manifest last. Files that are there already are not sent again.
+        """Upload a folder: all files, several at a time, the manifest last. Files that are there already are not sent again.
 
         Until the manifest is there, what is at this place is no result. Files of an earlier push that are no longer part of the folder
         are removed; files of others stay.
 
         Raises:
-            InputError: no folder. ResourceError: no connection. IntegrityError: what arrived is not what was sent.
+            InputError: no folder. UsageError: files of others have the same names. IntegrityError: a file did not arrive.
         """
-        if not Path(frm).is_dir():
+        frm = Path(frm)
+        if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))
-        transfer.push(Path(frm), self.side)
+        files = {name: Expected((frm / name).stat().st_size, store.sha256_file(frm / name)) for name in _files_below(frm)}
+        sizes, earlier = self.tree(), self.uploaded()
+        before = earlier.files if earlier is not None else {}
+        there = {name for name, one in files.items() if before.get(name) == one and sizes.get(name) == one.size}
+        if earlier is not None and earlier.complete and there == set(before) == set(files):
+            return
+        foreign = sorted(set(files) & set(sizes)) if earlier is None else []
+        if foreign:
+            raise UsageError("the output address holds files of something else", where=self.text, got=", ".join(foreign[:8]),
+                remedy="choose an address at which nothing is")  # fmt: skip
+        manifest = {store.MANIFEST} & set(files)
+        (self / store.MANIFEST).remove()  # from now on it is no result
+        record = self / CONTENTS
+        if earlier is not None:
+            record.save(Upload(False, before).content())
+        for name in sorted(set(before) - there):  # after this, a file of the right size is one of those that are now sent
+            (self / name).remove()
+        record.save(Upload(False, files).content())
+        with log.task(f"uploading {self}", len(files)) as bar:
+            for names in _grouped(sorted(set(files) - there - manifest), 4 * _FILES_AT_ONCE):
+                self._put(frm, names)
+                bar.advance(len(names))
+        sizes = self.tree()
+        for name in sorted(set(files) - manifest):
+            if sizes.get(name) != files[name].size:
+                raise IntegrityError("a file did not arrive as it was sent", where=f"{self}/{name}", expected=f"{files[name].size} bytes",
+                    got=f"{sizes.get(name, 'no')} bytes", remedy="repeat the command to upload it again")  # fmt: skip
+        record.save(Upload(True, files).content())
+        if manifest:
+            (self / store.MANIFEST).save(store.read_bytes(frm / store.MANIFEST))
+
+    def _put(self, frm: Path, names: Sequence[str]) -> None:
+        if self.local is not None:
+            for name in names:
+                store.copy_in_tree(frm / name, self.local / name)
+            store.sync_tree(self.local)
+            return
+        options: dict[str, Any] = {}
+        if PACKAGES[scheme_of(self.text)][0] == "s3fs":
+            options = {"chunksize": max(_CHUNK, *((frm / name).stat().st_size // 9000 for name in names))}
+        with _in_words("uploading", self.text, _NO_BUCKET):
+            self._files.put([str(frm / name) for name in names], [f"{self._path}/{name}" for name in names],
+                batch_size=_FILES_AT_ONCE, **options)  # fmt: skip
+
+    def put_file(self, file: Path) -> None:
+        """Upload one file to this place."""
+        if self.local is not None:
+            store.write_blocks(self.local, store.blocks_of(file))
+            return
+        with _in_words("uploading", self.text, _NO_BUCKET):
+            self._files.put_file(str(file), self._path)
+
+
+def _grouped(names: Sequence[str], count: int) -> Iterable[Sequence[str]]:
+    return (names[begin : begin + count] for begin in range(0, len(names), count))
+
+
+def _part(path: Path) -> Path:
+    return path.with_name(f".{path.name}.fetching.part")
+
+
+def _is_here(path: Path, wanted: Expected) -> bool:
+    return bool(wanted.sha256) and path.is_file() and path.stat().st_size == wanted.size and store.sha256_file(path) == wanted.sha256
+
+
+def _verify(part: Path, wanted: Expected, where: str) -> None:
+    size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted.sha256 else ""
+    if (size, sha256) != (wanted.size, wanted.sha256):
+        store.remove(part)
+        raise IntegrityError("what came is not what was uploaded", where=where,
+            expected=f"{wanted.size} bytes, sha256 {wanted.sha256[:16]}...", got=f"{size} bytes, sha256 {sha256[:16]}...",
+            remedy="repeat the command; if it fails again, upload the data again")  # fmt: skip

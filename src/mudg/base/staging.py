@@ -13,15 +13,14 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from mudg.base import log, store, transfer
+from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.base.location import Location
-from mudg.base.remote import PACKAGES, checked_address, scheme_of
+from mudg.base.location import PACKAGES, Location, checked_address, scheme_of
 from mudg.base.run_folder import take_lock
 
 _OUTPUTS: Final = ("out", "to")
@@ -58,7 +57,8 @@ def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]], scra
         return call(args)
     with plan.locked():
         for given, at in plan.inputs.items():
-            _fetch_input(given, at)
+            log.info(f"fetching {given}")
+            given.fetch(at, mirror=True)
         for given, at in plan.outputs.items():
             _fetch_earlier(given, at)
         result = call(plan.args)
@@ -204,36 +204,20 @@ def _make_private(folder: Path) -> None:
 # there and back -------------------------------------------------------------------------------------------------------
 
 
-def _fetch_input(given: Location, at: Path) -> None:
-    log.info(f"fetching {given}")
-    if not given.exists():
-        given.fetch(at)  # says what is missing
-    names = transfer.fetch(given.side, at)
-    if at.is_dir():
-        _keep_only(at, names)  # a part of an earlier version would be taken for one of this
-
-
-def _keep_only(folder: Path, names: Collection[str]) -> None:
-    for path in [path for path in folder.rglob("*") if not path.is_dir() and path.relative_to(folder).as_posix() not in names]:
-        store.remove(path)
-
-
 def _fetch_earlier(given: Location, at: Path) -> None:
     """What the output holds already: the verb reuses it, or refuses it. What an interrupted command left here goes first."""
     store.make_folder(at.parent)
     if at.exists() or not given.exists():
         return
-    record = transfer.uploaded(given.side)
+    record = given.uploaded()
     if record is not None and not record.complete:
         return  # an upload that was stopped; this one takes its place
-    if record is None and given.side.storage.is_folder(given.side.path) and store.MANIFEST not in given.names():
+    if record is None and store.MANIFEST not in (names := given.names()) and names:
         raise UsageError("the output address holds files of something else", where=str(given),
             remedy="choose an address at which nothing is")  # fmt: skip
     log.info(f"fetching what {given} holds")
     partial = at.parent / f".{at.name}.earliers.part"
-    names = transfer.fetch(given.side, partial)
-    if partial.is_dir():
-        _keep_only(partial, names)
+    given.fetch(partial, mirror=True)
     store.take_place(partial, at)
 
 
@@ -249,4 +233,4 @@ def _upload(given: Location, at: Path) -> None:
         if path.is_dir():
             target.push(path)
         else:
-            target.side.storage.put(target.side.path, path, store.sha256_file(path))
+            target.put_file(path)

@@ -31,8 +31,8 @@ from mudg.models.labels.ground import driven_path
 from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.models.labels.labellers import labeller
 from mudg.report.annotate_page import write_page
-from mudg.stages.batches import lists
 from mudg.stages.batches.listed import ListedRun, run_listed
+from mudg.stages.batches.plan import read_list
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
@@ -91,7 +91,7 @@ def run_many(
     config: AnnotateConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
 ) -> dict[str, Any]:
     """``run`` for every scene of a list; see ``stages/batches/listed.py``."""
-    entries = lists.read_list(listed)
+    entries = read_list(listed)
     return run_listed(ListedRun("annotate", dataclasses.replace(config, processes=1), entries, out, jobs, overwrite, shard, listed))
 
 

@@ -1,4 +1,4 @@
-"""``mudg batch run|status|cost|retry|review|accept|reject``: steps over long lists of driving logs, on any number of workers.
+"""``mudg batch run|status|retry``: steps over long lists of driving logs, on this machine, Ray or Slurm.
 
 The machinery is in ``stages/batches/``; what it promises, and how to use it, in docs/batch.md.
 """
@@ -6,34 +6,42 @@ The machinery is in ``stages/batches/``; what it promises, and how to use it, in
 from __future__ import annotations
 
 import os
-import re
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import refuse_overlaps
-from mudg.stages.batches import costs, engines, quality, retries, review, status
-from mudg.stages.batches.folders import BatchFolder
-from mudg.stages.batches.listed import FAILED_BASE, FAILED_MOST
-from mudg.stages.batches.lists import CITY, Entry, read_list, shard_of
-from mudg.stages.batches.local import WorkersEnd, run_workers
-from mudg.stages.batches.plan import COMMAND, OF_A_LINE, REVISION, BatchPlan, plan_of
-from mudg.stages.batches.work import ASKED_TO_STOP, WorkRequest, WorkRules
+from mudg.stages.batches import engines, status
+from mudg.stages.batches.child import Stop
+from mudg.stages.batches.listed import exit_code
+from mudg.stages.batches.plan import (
+    CITY,
+    COMMAND,
+    OF_A_LINE,
+    REVISION,
+    BatchPlan,
+    Entry,
+    parse_shard,
+    plan_of,
+    read_list,
+    shard,
+)
+from mudg.stages.batches.records import BatchFolder, slurm_tasks_left
+from mudg.stages.batches.work import DONE, STOPPED, Job, Report, is_open
 from mudg.stages.config import RunConfig
 from mudg.stages.config.batch import BatchConfig
 from mudg.stages.config.presets import PresetName, run_preset
 
-_LIMIT: Final = re.compile(r"\d+(\.\d+)?%?")
-_PATHS: Final = ("poses", "boxes")
-"""Settings of a line that are paths."""
+_POLL_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -41,18 +49,19 @@ class BatchRequest:
     """What ``mudg batch run`` is asked for.
 
     Args:
-        listed: path or address of the list. out: path or address of the results. batch: how work is shared out. run: settings of the
-            steps. words: the command line behind ``mudg``, for engines that start it elsewhere. wait: for the end of an array job.
-        scratch: folder for unfinished results.
+        listed: path or address of the list. out: path or address of the results. batch: where scenes run. run: settings of the steps.
+            shard: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array job. scratch: folder for unfinished results.
+            take_over: drive the batch even if another driver may be alive elsewhere.
     """
 
     listed: str
     out: str
     batch: BatchConfig
     run: RunConfig
-    words: tuple[str, ...] = ()
+    shard: str = ""
     wait: bool = False
     scratch: Path | None = None
+    take_over: bool = False
 
 
 def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
@@ -62,90 +71,98 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
         dry: only say what there is to do.
 
     Returns:
-        Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99), or 143 if it was asked to
-        stop.
+        Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
 
     Raises:
-        UsageError: settings that contradict each other, or an output that belongs to another batch. InputError: a bad list.
+        UsageError: settings that contradict each other, an output that belongs to another batch, or to another driver. InputError: a
+            bad list. KeyboardInterrupt: asked to stop; running steps have written checkpoints.
     """
-    entries = [_absolute(entry) for entry in read_list(asked.listed, (*OF_A_LINE, REVISION))]
-    plan = plan_for(asked.batch, asked.run)
-    folder, rules = BatchFolder(Location.of(asked.out)), rules_of(asked.batch, asked.scratch)
+    listed = read_list(asked.listed, (*OF_A_LINE, REVISION))
+    part = parse_shard(asked.shard)
+    if asked.shard and asked.batch.engine != "local":
+        raise UsageError("the engine itself shares out the list", where="--shard", got=f"--engine {asked.batch.engine}")
+    plan, folder = plan_for(asked.batch, asked.run), BatchFolder(Location.of(asked.out))
     if folder.out.local is not None:
         folder = BatchFolder(Location.of(folder.out.local.absolute()))
-    _refuse_overlap(entries, folder, asked.listed)
+    _refuse_overlap(listed, folder, asked.listed)
+    if not dry:
+        folder.begin(plan, listed)
+    done, failed, ours = folder.keys("done"), folder.keys("failed"), shard(listed, part)
+    entries = [entry for entry in ours if is_open(plan, entry, done, failed)]
     if dry:
-        return _dry(folder, plan, entries)
-    folder.begin(plan, entries)
-    if asked.batch.engine in ("slurm", "ray"):
-        work = WorkRequest(folder, plan, entries, rules)
-        return engines.submitted(engines.Submission(asked.batch, folder, asked.words, asked.wait, work))
-    shard = engines.shard_of_environment(asked.batch.shards) if asked.batch.engine == "env" else (0, 1)
-    jobs = asked.batch.jobs or (native.default_threads() if asked.batch.engine == "local" else 1)
-    jobs = min(jobs, max(1, sum(shard_of(entry.name, shard[1]) == shard[0] for entry in entries)))
-    rules = replace(rules, threads=max(1, native.default_threads() // jobs))
-    log.info(f"batch: {len(entries)} scenes, shard {shard[0]} of {shard[1]}, {jobs} at a time with {rules.threads} threads each")
-    with log.task("batch", len(entries) * len(plan.stages)) as bar:
-        ended = run_workers(WorkRequest(folder, plan, entries, rules, shard), jobs, lambda _: bar.advance())
-    return _told(folder, ended)
+        keys = [unit.key for entry in ours for unit in plan.units(entry)]
+        counts = {"scenes": len(ours), "steps": len(keys), DONE: len(done.intersection(keys)), "failed": len(failed.intersection(keys))}
+        left = counts["steps"] - counts[DONE] - counts["failed"]
+        text = f"{len(ours)} scenes: {' -> '.join(stage.name for stage in plan.stages)}"
+        return {**counts, "left": left, "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"}
+    job = Job(folder, plan, max(1, round(asked.batch.cpus)), asked.batch.grace_s, _absolute(asked.scratch))
+    with folder.owned(part, numbered=asked.shard.startswith("env"), take_over=asked.take_over) as owner:
+        if asked.batch.engine == "slurm":
+            number, messages = engines.submit_to_slurm(job, entries, asked.batch)
+            me = next(one for one in folder.owners().values() if one.process == os.getpid())
+            owner.save(me.model_copy(update={"job": number}).model_dump_json().encode())
+            return _submitted(folder, plan, entries, number, messages, asked.wait)
+        counts = _run(job, entries, asked.batch)
+    text = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "nothing was left to do here"
+    return {"counts": dict(counts), "out": str(folder.out), "text": f"{text}\nmudg batch status {folder.out}",
+            "exit_code": exit_code(counts.total() - counts[DONE])}  # fmt: skip
 
 
-def _told(folder: BatchFolder, ended: WorkersEnd) -> dict[str, Any]:
-    bad = sum(count for state, count in ended.counts.items() if state != "done")
-    code = ASKED_TO_STOP if ended.stopped else min(FAILED_BASE + bad, FAILED_MOST) if bad else 0
-    text = ", ".join(f"{count} {state}" for state, count in sorted(ended.counts.items())) or "nothing was left to do here"
-    if ended.gave_up:
-        text += "; stopped: more steps have failed than --max-failures allows"
-        code = code or FAILED_BASE
-    if ended.stopped:
-        text += "; stopped as asked, the same command goes on"
-    return {"counts": dict(ended.counts), "out": str(folder.out), "text": f"{text}\nmudg batch status {folder.out}", "exit_code": code}
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else path.absolute()
+
+
+def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    with log.task("batch", len(entries) * len(job.plan.stages)) as bar:
+
+        def tell(report: Report) -> None:
+            if report.state != STOPPED:
+                counts[report.state] += 1
+            if report.state not in (DONE, STOPPED) and batch.engine == "ray":
+                log.warn(f"{report.scene} {report.stage} {report.state}: {report.words}")
+            bar.advance()
+
+        if batch.engine == "ray":
+            engines.run_on_ray(job, entries, batch, tell)
+            return counts
+        cores = native.default_threads()
+        jobs = max(1, min(batch.jobs or cores, len(entries)))
+        threads = max(1, cores // jobs)
+        log.info(f"batch: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
+        engines.LocalRun(replace(job, threads=threads), entries, jobs, Stop(job.grace_s)).run(tell)
+    return counts
+
+
+def _submitted(
+    folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry], number: str, messages: Path, wait: bool
+) -> dict[str, Any]:
+    result = {"job": number, "out": str(folder.out), "text": f"job {number}; its messages: {messages}\nmudg batch status {folder.out}"}
+    if not wait:
+        return result
+    try:
+        while slurm_tasks_left(number):
+            time.sleep(_POLL_S)
+    except OSError as error:
+        raise ResourceError("Slurm does not answer", where="squeue", got=str(error)) from error
+    done = folder.keys("done")
+    return {**result, "exit_code": exit_code(sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries))}
 
 
 def plan_for(batch: BatchConfig, settings: RunConfig) -> BatchPlan:
     """The plan that settings ask for; paths in the settings that exist from here are made absolute, since steps run elsewhere."""
     values = _with_absolute_paths(configuration.to_dict(settings))
     own = bool(batch.command) and batch.stages == BatchConfig().stages
-    command = tuple(_absolute_program(word) for word in batch.command)
+    command = tuple(os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word for word in batch.command)
     return plan_of(() if own else tuple(name for name in batch.stages if name != COMMAND or command), values, command)
 
 
 def _with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
-    made: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            made[name] = _with_absolute_paths(value)
-        else:
-            made[name] = os.path.abspath(value) if isinstance(value, str) and "/" in value and os.path.exists(value) else value
-    return made
-
-
-def _absolute_program(word: str) -> str:
-    return os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word
-
-
-def rules_of(batch: BatchConfig, scratch: Path | None) -> WorkRules:
-    """Rules of the workers; UsageError where a setting cannot be read.
-
-    Args:
-        scratch: folder for unfinished results (None: in the output if that is a folder, else the system's).
-    """
-    if batch.max_failures and not _LIMIT.fullmatch(batch.max_failures):
-        raise UsageError("not a number of failures", where="--max-failures", got=batch.max_failures, expected="as 20 or 5%")
-    return WorkRules(
-        lease_s=batch.lease_s, grace_s=batch.grace_s, patience_s=batch.patience_s, steal=batch.steal,
-        bounds=quality.parse_bounds(batch.bounds), second_share=batch.verify_share, most_failures=batch.max_failures,
-        scratch=None if scratch is None else Path(scratch).absolute(), scratch_gb=batch.scratch_gb,
-    )  # fmt: skip
-
-
-def _absolute(entry: Entry) -> Entry:
-    settings = {
-        name: os.path.abspath(value) if name in _PATHS and os.path.exists(value) else value for name, value in entry.settings.items()
-    }
-    if entry.source == CITY or "://" in entry.source:
-        return Entry(entry.name, entry.source, settings)
-    return Entry(entry.name, os.path.abspath(entry.source), settings)
+    return {
+        name: _with_absolute_paths(value) if isinstance(value, Mapping)
+        else os.path.abspath(value) if isinstance(value, str) and "/" in value and os.path.exists(value) else value
+        for name, value in values.items()
+    }  # fmt: skip
 
 
 def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) -> None:
@@ -159,65 +176,22 @@ def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) 
     refuse_overlaps([out], read)
 
 
-def _dry(folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry]) -> dict[str, Any]:
-    done, failed = folder.keys("done"), folder.keys("failed")
-    keys = [unit.key for entry in entries for unit in plan.units(entry)]
-    counts = {
-        "scenes": len(entries), "steps": len(keys), "done": sum(key in done for key in keys), "failed": sum(key in failed for key in keys),
-    }  # fmt: skip
-    left = counts["steps"] - counts["done"] - counts["failed"]
-    words = " -> ".join(stage.name for stage in plan.stages)
-    text = f"{counts['scenes']} scenes: {words}\n{counts['done']} steps done, {counts['failed']} failed, {left} to do"
-    return {**counts, "left": left, "text": text}
+def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:
+    """How far a batch is, what has failed and what it took.
 
-
-def show_status(out: str, html: bool = False) -> dict[str, Any]:
-    """How far a batch is. html: also write ``status.html`` in its folder."""
-    found_in = BatchFolder(Location.of(out))
-    found = status.read_status(found_in)
-    result: dict[str, Any] = {**found.record(), "text": status.text_of(found)}
-    if html:
-        page = Location.of(out) / "status.html"
-        page.save(status.page_of(found).encode())
-        if found.for_review:
-            review.write_page(found_in, review.waiting(found_in))
-        result["page"] = str(page)
-        result["text"] += f"\npage: {page}"
-    return result
-
-
-def show_review(out: str) -> dict[str, Any]:
-    """Results outside the bounds, which wait for somebody to look at them; their pictures are on a page. InputError: no batch is here."""
-    folder = BatchFolder(Location.of(out))
-    folder.plan()
-    found = review.waiting(folder)
-    page = review.write_page(folder, found)
-    waiting = [{"scene": one.scene, "step": one.stage, "problems": list(one.problems), "place": one.place} for one in found]
-    return {"waiting": waiting, "page": str(page), "text": f"{review.text_of(found, out)}\npage: {page}"}
-
-
-def judge(out: str, scenes: Sequence[str], accepted: bool) -> dict[str, Any]:
-    """Accept or reject results that wait for review; see ``review.judge``."""
-    folder = BatchFolder(Location.of(out))
-    folder.plan()
-    chosen = review.judge(folder, scenes, accepted)
-    words = "accepted: the next mudg batch run goes on with them" if accepted else "rejected"
-    return {"scenes": [one.scene for one in chosen], "text": f"{len(chosen)} results {words}"}
-
-
-def show_cost(out: str, price: float, storage_price: float) -> dict[str, Any]:
-    """What a batch took, by step, and what the rest is going to take."""
-    found = costs.costs_of(status.read_status(BatchFolder(Location.of(out))), price, storage_price)
-    return {**found, "text": costs.text_of(found)}
-
-
-def watch_status(out: str, html: bool, every_s: float) -> dict[str, Any]:
-    """``show_status``, again and again until nothing is left; 0 s: once."""
+    Args:
+        html: also write ``status.html`` in its folder. price: of a core-hour. every_s: show it again until nothing is left (0: once).
+    """
     while True:
-        found = show_status(out, html)
-        if every_s <= 0 or not found["left"]:
-            return found
-        log.info(*found["text"].splitlines())
+        state = status.read_status(BatchFolder(Location.of(out)), price)
+        result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}
+        if html:
+            page = Location.of(out) / "status.html"
+            page.save(status.page_of(state).encode())
+            result |= {"page": str(page), "text": f"{result['text']}\npage: {page}"}
+        if every_s <= 0 or not result["left"]:
+            return result
+        log.info(*result["text"].splitlines())
         time.sleep(every_s)
 
 
@@ -237,21 +211,20 @@ def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -
 
 
 def retry(out: str, reason: str = "") -> dict[str, Any]:
-    """Forget failures, so that the next ``mudg batch run`` tries them again. reason: codes or names, with commas (empty: all).
+    """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty: all).
 
     Raises:
-        InputError: no batch is here. UsageError: an unknown reason.
+        InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes.
     """
-    folder, wanted = BatchFolder(Location.of(out)), retries.parse_reasons(reason)
-    folder.plan()
-    forgotten: list[str] = []
-    by_key = status.read_status(folder).failures
-    for key, failure in by_key.items():
-        if not wanted or failure.code in wanted:
-            folder.failed(key).remove()
-            review.forget(folder, failure.scene, failure.stage)
-            forgotten.append(key)
-    if not forgotten and wanted:
+    folder, words = BatchFolder(Location.of(out)), reason.replace(",", " ").split()
+    if not all(word.isdecimal() for word in words):
+        raise UsageError("unknown reason", where="--reason", got=reason, expected="exit codes with commas, as 5,137")
+    folder.stages()
+    failures = list(folder.records("failed"))
+    chosen = [one for one in failures if not words or one.code in map(int, words)]
+    for one in chosen:
+        folder.record("failed", one.key).remove()
+    if words and not chosen:
         raise InputError("nothing failed for this reason", where=str(folder.out), got=reason,
-            expected=", ".join(sorted({str(one.code) for one in by_key.values()})) or "no failures at all")  # fmt: skip
-    return {"forgotten": len(forgotten), "text": f"{len(forgotten)} failed steps will be tried again by the next mudg batch run"}
+            expected=", ".join(sorted({str(one.code) for one in failures})) or "no failures at all")  # fmt: skip
+    return {"forgotten": len(chosen), "text": f"{len(chosen)} failed steps will be tried again by the next mudg batch run"}

@@ -35,8 +35,8 @@ from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.data.scene.check import check_distance
 from mudg.report.top_view import TopView, draw_top_view
-from mudg.stages.batches import lists
 from mudg.stages.batches.listed import ListedRun, run_listed
+from mudg.stages.batches.plan import read_list
 from mudg.stages.config import FuseConfig
 
 _OUTPUT = VerbOutput("fuse", 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
@@ -93,7 +93,7 @@ def run_many(
     config: FuseConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
 ) -> dict[str, Any]:
     """``run`` for every scene of a list; see ``stages/batches/listed.py``."""
-    entries = lists.read_list(listed)
+    entries = read_list(listed)
     return run_listed(ListedRun("fuse", config, entries, out, jobs, overwrite, shard, listed))
 
 

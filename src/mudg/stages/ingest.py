@@ -20,9 +20,8 @@ from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_
 from mudg.data.scene import SCENE_FILES, SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
 from mudg.report import contact_sheet
-from mudg.stages.batches import lists
 from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.plan import OF_A_LINE
+from mudg.stages.batches.plan import OF_A_LINE, read_list
 from mudg.stages.config import IngestConfig
 
 CITY = "city"
@@ -143,7 +142,7 @@ def run_many(
 ) -> dict[str, Any]:
     """``run`` for every log of a list; see ``stages/batches/listed.py``. A line may set format, sequence, frames, cameras (with
     commas), poses, boxes and seed (of a city) for itself."""
-    entries = lists.read_list(listed, OF_A_LINE)
+    entries = read_list(listed, OF_A_LINE)
     return run_listed(ListedRun("ingest", config, entries, out, jobs, overwrite, shard, listed))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,15 +16,16 @@ OUT = Flag("OUT", "first")
 
 
 class BatchRun(Step):
-    """Process a list of logs on this machine, Slurm or Ray, or go on with it."""
+    """Process a long list of logs, on this machine, Ray, Slurm or any scheduler, or go on with it."""
 
     section = "many drives"
     examples = (
         "mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
-        "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine slurm --shards 500 --config recipe.yaml",
+        "mudg batch run --list logs.txt --out /shared/runs --engine slurm --jobs 500 --slurm-options time=4:00:00 --config recipe.yaml",
+        "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine ray --ray-address auto --cpus 4 --gpus 1",
     )
     smaller = "fewer --jobs, or smaller images (--set ingest.resolution=960)"
-    short = ("stages", "command", "engine", "shards", "jobs", "max_failures")
+    short = ("stages", "command", "engine", "jobs", "cpus", "gpus")
     list: Annotated[str, Flag("FILE|URL")]
     """File with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Sources may be addresses."""
     out: Annotated[str, Flag("FOLDER|URL")]
@@ -40,8 +40,13 @@ class BatchRun(Step):
     """Folder for unfinished results and fetched inputs (not given: in --out if that is a folder, else the system's)."""
     dry_run: bool = False
     """Only say what there is to do."""
+    shard: Annotated[str, Flag("I/N")] = ""
+    """Only the I-th of N parts of the list, from 0. env, env/N: the I-th as the scheduler numbers this task (SLURM_ARRAY_TASK_ID,
+    JOB_COMPLETION_INDEX, SKYPILOT_NODE_RANK or AWS_BATCH_JOB_ARRAY_INDEX)."""
     wait: bool = False
     """With --engine slurm, wait for the end of the job."""
+    take_over: bool = False
+    """Go on although a driver on another machine may still work on the batch."""
     settings: BatchConfig
 
     @classmethod
@@ -57,21 +62,25 @@ class BatchRun(Step):
         from mudg.stages import batch
 
         settings = batch.settings_of(self.preset, self.config, self.set)
-        request = batch.BatchRequest(self.list, self.out, self.settings, settings, tuple(sys.argv[1:]), self.wait, self.scratch)
+        request = batch.BatchRequest(
+            self.list, self.out, self.settings, settings, self.shard, self.wait, self.scratch, self.take_over
+        )
         return batch.run(request, self.dry_run)
 
 
 class BatchProgress(Step):
-    """Show how far a batch is."""
+    """Show how far a batch is, what failed and what it took."""
 
     section = "many drives"
-    examples = ("mudg batch status runs --html",)
+    examples = ("mudg batch status runs --html --price 0.04",)
     out: Annotated[str, OUT]
     """Folder or address of a batch."""
     html: bool = False
     """Also write OUT/status.html, with figures of the logs."""
     watch_s: float = 0.0
     """Show it again every so many seconds, until nothing is left (0 = once)."""
+    price: float = 0.0
+    """Price of one core-hour."""
 
     @classmethod
     def verb(cls) -> str:
@@ -80,7 +89,7 @@ class BatchProgress(Step):
     def run(self) -> dict[str, Any]:
         from mudg.stages import batch
 
-        return batch.watch_status(self.out, self.html, self.watch_s)
+        return batch.show_status(self.out, self.html, self.price, self.watch_s)
 
 
 class BatchRetry(Step):

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mudg.base import store, transfer
+from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError
 from mudg.base.location import Location
 from mudg.data.clips import shards as clip_shards
@@ -81,7 +81,7 @@ class FolderOfShards:
     def open(cls, place: Location) -> FolderOfShards:
         """The folder, or one inside a folder that was uploaded as a whole, such as the output of a training."""
         for above, prefix in ((place, ""), (_parent(place), f"{place.name}/")):
-            found = transfer.uploaded(above.side) if above is not None else None
+            found = above.uploaded() if above is not None else None
             if found is not None:
                 return cls(place, {name[len(prefix) :]: one.sha256 for name, one in found.files.items() if name.startswith(prefix)})
         return cls(place, {})

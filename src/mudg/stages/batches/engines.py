@@ -1,102 +1,221 @@
-"""Engines: where the workers of a batch run. Every engine starts the same workers; no engine holds state of a batch.
+"""Engines: who runs the scenes of a batch. Threads of this process, tasks of a Ray cluster, or an array job of Slurm, through submitit.
 
-``local`` and ``env`` work in this process; ``slurm`` submits an array job whose tasks are ``env``; ``ray`` runs tasks on a cluster.
+Scheduling, retries of lost workers and requeueing belong to the engine. All of them call ``run_scene``, which does only what is missing.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final, Protocol
+import queue
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
 
-from mudg.base.errors import UsageError
-from mudg.stages.batches import on_ray, slurm
-from mudg.stages.batches.folders import BatchFolder
-from mudg.stages.batches.work import WorkRequest
+from mudg.base import log, store
+from mudg.base.errors import ResourceError, UsageError
+from mudg.base.location import Location
+from mudg.stages.batches.child import Stop
+from mudg.stages.batches.plan import REVISION, Entry, shard
+from mudg.stages.batches.work import Job, Report, run_scene
 from mudg.stages.config.batch import BatchConfig
 
-
-@dataclass(frozen=True)
-class Submission:
-    """What an engine submits. words: the command line behind ``mudg``; wait: for its end; work: of all shards together."""
-
-    batch: BatchConfig
-    folder: BatchFolder
-    words: tuple[str, ...]
-    wait: bool
-    work: WorkRequest
+Tell = Callable[[Report], None]
+_LOST_NODES: Final = 20
+"""How often Ray runs a scene again whose node or process is gone."""
+_AT_ONCE: Final = 2000
+"""Scenes that wait in Ray's queue at a time."""
+_GB: Final = 1_000_000_000
 
 
-SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
-    ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
-    ("JOB_COMPLETION_INDEX", "", ""),
-    ("SKYPILOT_JOB_RANK", "SKYPILOT_NUM_JOBS", ""),
-    ("SKYPILOT_NODE_RANK", "SKYPILOT_NUM_NODES", ""),
-    ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE", ""),
-)
-"""Variables that number the tasks of a scheduler: the index, the count and the lowest index (empty: 0)."""
+# this machine ---------------------------------------------------------------------------------------------------------
 
 
-def shard_of_environment(shards: int, environment: Mapping[str, str] | None = None) -> tuple[int, int]:
-    """(i, n): which shard a task is, from the first of ``SHARD_VARIABLES`` that is set.
+@dataclass
+class LocalRun:
+    """Scenes on this machine, ``jobs`` at a time. The log of the next scene is fetched meanwhile."""
 
-    Args:
-        shards: n, where the scheduler does not tell it (1: then it must).
+    job: Job
+    entries: Sequence[Entry]
+    jobs: int
+    stop: Stop
+    _threads: list[concurrent.futures.Future[None]] = field(default_factory=list)
+    _ahead: dict[str, threading.Thread] = field(default_factory=dict)
+
+    def run(self, tell: Tell) -> None:
+        """Do them all. Ctrl-C and SIGTERM stop every step with a checkpoint, a second one at once; KeyboardInterrupt goes on then."""
+        waiting, told = deque(self.entries), queue.SimpleQueue[Report | None]()
+
+        def work() -> None:
+            try:
+                while waiting and not self.stop.asked:
+                    try:
+                        entry = waiting.popleft()
+                    except IndexError:  # another thread took the last one
+                        return
+                    self._fetch_ahead(entry, waiting)
+                    for report in run_scene(self.job, entry, self.stop):
+                        told.put(report)
+            finally:
+                told.put(None)
+
+        with concurrent.futures.ThreadPoolExecutor(self.jobs) as pool:
+            try:
+                self._threads = [pool.submit(work) for _ in range(self.jobs)]
+                left = self.jobs
+                while left:
+                    report = told.get()
+                    if report is not None:
+                        tell(report)
+                        continue
+                    left -= 1
+                    for thread in concurrent.futures.wait(self._threads, 0.0).done:
+                        thread.result()
+            except BaseException:
+                self.stop.ask()
+                try:
+                    self.wait()
+                except KeyboardInterrupt:
+                    self.stop.ask()
+                raise
+        self.job.inputs.clear()
+
+    def wait(self) -> None:
+        """Wait until no step runs."""
+        concurrent.futures.wait(self._threads)
+
+    def _fetch_ahead(self, entry: Entry, waiting: Sequence[Entry]) -> None:
+        """Begin to fetch the log of the next scene, once that of this one is here."""
+        thread = self._ahead.pop(entry.name, None)
+        while thread is not None and thread.is_alive() and not self.stop.asked:
+            thread.join(0.2)
+        for following in list(waiting)[:1]:
+            first = next(self.job.plan.units(following))
+            reads = "://" in following.source and "{source}" in " ".join(first.stage.words) and not first.stage.direct
+            if reads and following.name not in self._ahead and not self.job.folder.record("done", first.key).exists():
+                version = following.settings.get(REVISION, "")
+                self._ahead[following.name] = self.job.inputs.fetch_ahead(Location.of(following.source), version, self.stop)
+
+
+# Ray ------------------------------------------------------------------------------------------------------------------
+
+
+def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tell) -> None:
+    """One task of a Ray cluster per scene: the one at ``ray_address``, the one Ray finds, or one on this machine.
 
     Raises:
-        UsageError: no such variable is set, or what it says is no shard.
+        ResourceError: Ray is not installed, or no cluster answers. KeyboardInterrupt: stopped; running steps have written checkpoints.
     """
-    found = os.environ if environment is None else environment
-    for index_name, count_name, first_name in SHARD_VARIABLES:
-        if not found.get(index_name):
-            continue
-        text = found[index_name]
-        count = found.get(count_name, "") if count_name and shards == 1 else ""
-        first = found.get(first_name, "") if first_name else ""
-        if not text.isdecimal() or (count and not count.isdecimal()):
-            raise UsageError("the scheduler's numbers cannot be read", where=index_name, got=text)
-        index, total = int(text) - (int(first) if first.isdecimal() else 0), int(count) if count else shards
-        if not 0 <= index < total:
-            raise UsageError("the task's number is not one of the shards", where=index_name, got=text, expected=f"0 to {total - 1}",
-                remedy="give --shards as many as the scheduler has tasks")  # fmt: skip
-        return index, total
-    raise UsageError("no scheduler has numbered this task", where="--engine env",
-        expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment")  # fmt: skip
+    try:
+        import ray
+    except ImportError as error:
+        raise ResourceError("the package ray is not installed", where="--engine ray", remedy="pip install 'mudg[ray]'") from error
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if not ray.is_initialized():
+        try:
+            ray.init(address=batch.ray_address or None, log_to_driver=False, logging_level="warning")
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ResourceError("no Ray cluster answers", where="--ray-address", got=str(error).split("\n")[0][:300]) from error
+    memory = {"memory": int(batch.memory_gb * _GB)} if batch.memory_gb else {}
+    options: dict[str, Any] = {"num_cpus": batch.cpus, "num_gpus": batch.gpus, "max_retries": _LOST_NODES, **memory}
+    task, common = ray.remote(scheduling_strategy="SPREAD", **options)(_ray_task), ray.put(job)
+    left, running = deque(entries), dict[Any, Entry]()
+    try:
+        while left or running:
+            while left and len(running) < _AT_ONCE:
+                entry = left.popleft()
+                running[task.remote(common, entry)] = entry
+            for one in ray.wait(list(running), timeout=1.0)[0]:
+                entry = running.pop(one)
+                try:
+                    for report in ray.get(one):
+                        tell(report)
+                except ray.exceptions.RayError as error:
+                    tell(Report(entry.name, "", "lost", words=str(error).splitlines()[0][:300]))
+    except KeyboardInterrupt:
+        for one in running:
+            ray.cancel(one, force=False)
+        ray.wait(list(running), num_returns=len(running), timeout=job.grace_s + 10) if running else None
+        raise
 
 
-class Engine(Protocol):
-    """What the engines have in common."""
-
-    def submit(self) -> str:
-        """Hand the tasks over; returns what the engine calls them."""
-        ...
-
-    def poll(self) -> int:
-        """Tasks that wait or run."""
-        ...
-
-    def cancel(self) -> None:
-        """Stop them, with checkpoints."""
-        ...
+def _ray_task(job: Job, entry: Entry) -> list[Report]:
+    log.set_quiet(True)
+    return run_scene(job, entry, Stop(job.grace_s))
 
 
-def submitted(asked: Submission) -> dict[str, Any]:
-    """Submit the tasks of a batch to Slurm, or run them on a Ray cluster."""
-    batch, here = asked.batch, os.getcwd()
-    words = slurm.task_words(asked.words, batch.shards)
-    if batch.engine == "slurm":
-        local = asked.folder.own.local
-        output = str(local / "slurm" / "%A_%a.txt") if local is not None else f"{here}/mudg-batch-%A_%a.txt"
-        job = slurm.SlurmJob(words, batch.shards, here, output, batch.grace_s, batch.slurm_at_once, batch.slurm_options)
-        array = slurm.SlurmArray(job)
-        number = array.submit()
-        if asked.wait:
-            array.wait()
-        text = f"job {number} with {batch.shards} tasks; its messages: {output}\nmudg batch status {asked.folder.out}"
-        return {"job": number, "shards": batch.shards, "out": str(asked.folder.out), "text": text}
-    tasks = on_ray.RayTasks(on_ray.RayJob(words, batch.shards, here, batch.ray_address, max(1, batch.jobs), batch.ray_gpus))
-    tasks.submit()
-    code = on_ray.worst_of(tasks.wait())
-    text = f"{batch.shards} tasks have ended\nmudg batch status {asked.folder.out}"
-    return {"shards": batch.shards, "out": str(asked.folder.out), "text": text, "exit_code": code}
+# Slurm ----------------------------------------------------------------------------------------------------------------
+
+
+class SlurmTask:
+    """The scenes of one task of an array job. Told that its time ends, it writes checkpoints, and submitit puts it back into the queue."""
+
+    def __init__(self, job: Job, entries: Sequence[Entry]) -> None:
+        self._job, self._entries = job, entries
+        self._run: LocalRun | None = None
+
+    def __call__(self) -> dict[str, int]:
+        """Do the scenes; returns how many steps ended how."""
+        counts: dict[str, int] = {}
+        self._run = LocalRun(self._job, self._entries, 1, Stop(self._job.grace_s))
+        signal.signal(signal.SIGTERM, lambda *_: self._run.stop.ask() if self._run is not None else None)
+        self._run.run(lambda report: counts.update({report.state: counts.get(report.state, 0) + 1}))
+        self._run = None
+        return counts
+
+    def checkpoint(self) -> Any:
+        """Called by submitit when the job is about to end: stop, and say what is to be run again."""
+        from submitit.helpers import DelayedSubmission
+
+        if self._run is not None:
+            self._run.stop.ask()
+            self._run.wait()
+        return DelayedSubmission(SlurmTask(self._job, self._entries))
+
+
+def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> tuple[str, Path]:
+    """Submit an array job of ``batch.jobs`` tasks; returns its number and the folder of its messages.
+
+    Raises:
+        ResourceError: submitit is not installed, or there is no Slurm, or it refuses. UsageError: options that cannot be.
+    """
+    try:
+        import submitit
+    except ImportError as error:
+        raise ResourceError("the package submitit is not installed", where="--engine slurm", remedy="pip install 'mudg[slurm]'") from error
+    local, given = job.folder.own.local, dict(_option(text) for text in batch.slurm_options)
+    if "time" not in given:
+        raise UsageError("Slurm needs to know how long a task may run", where="--slurm-options", expected="time=4:00:00 among them")
+    folder = local / "slurm" if local is not None else Path.cwd() / "mudg-batch-slurm"
+    store.make_folder(folder)
+    folder.chmod(0o700)  # tasks are pickles that nobody else may write
+    count = max(1, min(batch.jobs or 1, len(entries)))
+    parts = [part for index in range(count) if (part := shard(entries, (index, count)))]
+    try:
+        executor = submitit.AutoExecutor(folder=folder / "%j", cluster="slurm", slurm_max_num_timeout=1000)
+        executor.update_parameters(
+            name="mudg-batch", cpus_per_task=max(1, round(batch.cpus)), slurm_signal_delay_s=int(batch.grace_s) + 20,
+            slurm_array_parallelism=count, slurm_additional_parameters={**given, "requeue": True},
+            **({"mem_gb": batch.memory_gb} if batch.memory_gb else {}), **({"gpus_per_node": round(batch.gpus)} if batch.gpus else {}),
+        )  # fmt: skip
+        with executor.batch():
+            tasks = [executor.submit(SlurmTask(replace(job, threads=max(1, round(batch.cpus))), part)) for part in parts]
+    except (RuntimeError, submitit.core.utils.FailedJobError, OSError) as error:
+        raise ResourceError("Slurm refused, or is not on this machine", where="sbatch", got=str(error).strip()[:500],
+            remedy="run this on a login node, or take another --engine") from error  # fmt: skip
+    return str(tasks[0].job_id).partition("_")[0], folder
+
+
+def _option(text: str) -> tuple[str, str | bool]:
+    name, separator, value = text.partition("=")
+    if not name or name.startswith("-") or any(letter in text for letter in "\n\r") or name in _OWN_OPTIONS:
+        raise UsageError("not an option for the array job", where="--slurm-options", got=text[:80],
+            expected="NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS)))  # fmt: skip
+    return name, value if separator else True
+
+
+_OWN_OPTIONS: Final = frozenset({"array", "job-name", "signal", "requeue", "no-requeue", "open-mode", "output", "error", "cpus-per-task"})

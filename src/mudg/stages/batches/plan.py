@@ -1,19 +1,159 @@
-"""What a batch does: its steps, the command of each, and the content key of a step of a scene."""
+"""What a batch does: the scenes of its list, its steps, the command of each, and the content key of a step of a scene.
+
+A list has one source a line, ``SOURCE [name=NAME] [setting=value ...]``, quoted as in a shell; ``#`` starts a comment.
+"""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import os
+import re
+import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import store
 from mudg.base.config import without_devices
-from mudg.base.errors import UsageError
+from mudg.base.errors import InputError, UsageError
+from mudg.base.location import Location
 from mudg.base.versions import version
-from mudg.stages.batches.lists import Entry
+from mudg.data.scene.schema import NAME_PATTERN
+
+CITY: Final = "city"
+BOOKKEEPING: Final = "_batch"
+"""Folder of a batch's own records, in its output."""
+_LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|\..*|status(-\d+-of-\d+)?\.json")
+SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
+    ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
+    ("JOB_COMPLETION_INDEX", "", ""),
+    ("SKYPILOT_JOB_RANK", "SKYPILOT_NUM_JOBS", ""),
+    ("SKYPILOT_NODE_RANK", "SKYPILOT_NUM_NODES", ""),
+    ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE", ""),
+)
+"""Variables with which schedulers number their tasks: the index, the count and the lowest index (empty: 0)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line of a list: the source, the name of its output folder, and settings of its own (``sequence``, ``frames``, ...)."""
+
+    name: str
+    source: str
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
+    """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
+
+    Relative sources count from the list's folder. Without a name, the last part of the source is taken.
+
+    Args:
+        listed: a path, or an address (``s3://...``). settings: settings a line may give.
+
+    Raises:
+        InputError: missing, empty, malformed, or two lines that would write one folder.
+    """
+    place = Location.of(listed)
+    if place.local is not None and place.local.is_dir():
+        lines = [
+            (str(entry), shlex.quote(entry.name))
+            for entry in sorted(place.local.iterdir())
+            if not _LEFT_OUT.fullmatch(entry.name)
+        ]
+        folder = place.text
+    else:
+        text = place.load().decode("utf-8", "replace")
+        lines = [(f"{place}: line {index + 1}", line) for index, line in enumerate(text.splitlines())]
+        folder = place.text.rpartition("/")[0] if place.local is None else str(place.local.parent)
+    entries = [entry for where, line in lines if (entry := _entry(line, where, folder, settings)) is not None]
+    if not entries:
+        raise InputError("the list is empty", where=str(place), expected="one source per line")
+    sources: dict[str, str] = {}
+    for entry in entries:
+        if entry.name in sources:
+            raise InputError(
+                "two entries would write the same folder", where=str(place), got=f"{sources[entry.name]} and {entry.source}",
+                remedy=f"give one of them another name: SOURCE name={entry.name}-2",
+            )  # fmt: skip
+        sources[entry.name] = entry.source
+    return entries
+
+
+def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry | None:
+    try:
+        words = shlex.split(line, comments=True)
+    except ValueError as error:
+        raise InputError("cannot parse the line", where=where, got=line[:80]) from error
+    if not words:
+        return None
+    given: dict[str, str] = {}
+    for word in words[1:]:
+        key, separator, value = word.partition("=")
+        if not separator or key not in ("name", *settings):
+            raise InputError(
+                "unknown setting in the line", where=where, got=word[:80],
+                expected=", ".join(f"{key}=..." for key in ("name", *settings)),
+                remedy="put quotes around a path with spaces")  # fmt: skip
+        given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
+    source = words[0] if words[0] == CITY else _below(folder, words[0])
+    name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
+    if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
+        raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
+    return Entry(name, source, given)
+
+
+def _below(folder: str, source: str) -> str:
+    """A source of a list in this folder; both may be addresses."""
+    if "://" in source:
+        return Location.of(source).text
+    if "://" in folder and not source.startswith(("/", "~")):
+        return f"{folder}/{source}"
+    return os.path.abspath(Path("" if "://" in folder else folder) / Path(source).expanduser())
+
+
+def shard_of(name: str, count: int) -> int:
+    """Which of ``count`` shards a scene belongs to: a hash of its name, so that it stays there when the list grows."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) % count
+
+
+def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
+    """(i, n) of ``"i/n"``; of ``"env"`` and ``"env/n"``, where the environment of a scheduler says i; (0, 1) of an empty text.
+
+    Raises:
+        UsageError: not of this form, or the environment does not say it.
+    """
+    if not text:
+        return 0, 1
+    first, _, count = text.partition("/")
+    if first == "env":
+        first, count = _numbered(count, environment)
+    if not first.isdecimal() or not count.isdecimal() or not int(first) < int(count):
+        raise UsageError("invalid shard", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n",
+            got=text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}")  # fmt: skip
+    return int(first), int(count)
+
+
+def _numbered(count: str, environment: Mapping[str, str]) -> tuple[str, str]:
+    for index_name, count_name, lowest_name in SHARD_VARIABLES:
+        index = environment.get(index_name, "")
+        if index:
+            lowest = environment.get(lowest_name, "") or "0"
+            index = str(int(index) - int(lowest)) if index.isdecimal() and lowest.isdecimal() else index
+            return index, count or environment.get(count_name, "")
+    raise UsageError("no scheduler has numbered this task", where="--shard env",
+        expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment")  # fmt: skip
+
+
+def shard(entries: Sequence[Entry], part: tuple[int, int]) -> list[Entry]:
+    """Entries of the i-th of n shards."""
+    return [entry for entry in entries if shard_of(entry.name, part[1]) == part[0]]
+
+
+# steps ----------------------------------------------------------------------------------------------------------------
 
 RULES_VERSION: Final = 2
 """Counts up when keys or commands change their meaning: results of older batches are then made again."""
