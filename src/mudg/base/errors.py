@@ -6,9 +6,12 @@ The command line maps each class to an exit code; nothing else in the package kn
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import os
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Final, Self
 
 MOST_LETTERS: Final = 200
@@ -40,6 +43,17 @@ def plain_lines(lines: Iterable[object]) -> str:
 def nearest(name: object, known: Iterable[str], least: float = 0.6) -> str:
     """The known name that is most like another; empty where none is. least: likeness from 0 to 1."""
     return next(iter(difflib.get_close_matches(str(name)[:MOST_LETTERS], list(known), 1, least)), "")
+
+
+def similar_path(path: str | os.PathLike[str]) -> str:
+    """A remedy for a path at which nothing is: the existing one that is most like it; empty where none is."""
+    whole = Path(path)
+    for part in (whole, *whole.parents):
+        if not part.exists() and part.parent.is_dir():
+            with contextlib.suppress(OSError):
+                near = nearest(part.name, [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")])
+                return f"did you mean {part.parent / near / whole.relative_to(part)}?" if near else ""
+    return ""
 
 
 def _listed(text: str, separator: str, most: int) -> str:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base.errors import InputError, IntegrityError, ResourceError
+from mudg.base.errors import InputError, IntegrityError, ResourceError, similar_path
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -322,7 +322,7 @@ def regular(path: Path) -> Path:
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError as error:
-        raise InputError("file not found", where=str(path)) from error
+        raise InputError("file not found", where=str(path), remedy=similar_path(path)) from error
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise InputError("file cannot be read", where=str(path), got=str(error)) from error
     if not stat.S_ISREG(mode):
@@ -606,7 +606,8 @@ def digest(path: Path) -> str:
     """
     path = Path(path)
     if not path.exists():
-        remedy = "repeat the command that wrote it: it was stopped while it replaced it" if retired_path(path).exists() else ""
+        stopped = "repeat the command that wrote it: it was stopped while it replaced it"
+        remedy = stopped if retired_path(path).exists() else similar_path(path)
         raise InputError("no such file or folder", where=str(path), remedy=remedy)
     if path.is_file():
         return sha256_file(path)

@@ -13,7 +13,7 @@ from typing import Any
 
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError
+from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError, similar_path
 from mudg.base.memory import in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
@@ -72,7 +72,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
-        raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}")
+        raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}", remedy=similar_path(source))
     _refuse_overlap(config, source, out)
     refuse_missing(config.synthesize, config.fit)
     torch.set_num_threads(native.default_threads())

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.run_folder import known_input
 
 BEST_FIRST: Final = ("mudg_s", "street_gaussians")
@@ -52,7 +52,7 @@ def find_run(folder: Path) -> RunParts:
         missing = [name for name, found in there.items() if not found]
         raise InputError("this folder holds no fitted scene", where=str(folder),
             expected="a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`",
-            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder")  # fmt: skip
+            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder", remedy=similar_path(folder))  # fmt: skip
     return RunParts(fits, scene, fused, True)
 
 
@@ -84,7 +84,8 @@ def scene_at(path: Path) -> Path:
     found = scene_of_run(path)
     if found is None:
         what = "folder is not a scene: it has no scene.json" if path.is_dir() else "no such file or folder"
-        raise InputError(what, where=str(path), expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`")
+        raise InputError(what, where=str(path), expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`",
+            remedy=similar_path(path))  # fmt: skip
     return found
 
 
@@ -93,7 +94,8 @@ def fused_at(path: Path) -> Path:
     for folder in (path, path / "fuse", known_input(path, "fused") or path):
         if (folder / "fuse.json").is_file():
             return folder
-    raise InputError("file not found", where=str(path / "fuse.json"), expected="a folder made by `mudg fuse`, or by `mudg run`")
+    raise InputError("file not found", where=str(path / "fuse.json"), expected="a folder made by `mudg fuse`, or by `mudg run`",
+        remedy=similar_path(path))  # fmt: skip
 
 
 def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
@@ -102,7 +104,7 @@ def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
         if (folder / "model.json").is_file():
             return folder
     raise InputError("this folder holds no fitted scene", where=str(path), expected="a folder made by `mudg fit`, or by `mudg run`",
-        got="" if path.is_dir() else "no such folder")  # fmt: skip
+        got="" if path.is_dir() else "no such folder", remedy=similar_path(path))  # fmt: skip
 
 
 def plain_fit_at(path: Path) -> Path:
