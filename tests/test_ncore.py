@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import lzma
+import os
 import shutil
 import struct
 import sys
@@ -592,3 +593,16 @@ def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Pat
             ingest(target.parent, tmp_path / f"flipped{number}")
             continue
         assert not (tmp_path / f"flipped{number}").exists()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link to a device", "link to nothing"])
+def test_a_folder_store_holds_regular_files_alone(kind: str, tmp_path: Path) -> None:
+    """A chunk that is a pipe would be waited for, by the package."""
+    store = tmp_path / "a.ncore4.zarr"
+    (store / "x").mkdir(parents=True)
+    (store / container.METADATA).write_bytes(b"")
+    chunk = store / "x" / "0"
+    os.mkfifo(chunk) if kind == "pipe" else chunk.symlink_to("/dev/zero" if kind == "link to a device" else "/nowhere")
+    with pytest.raises(InputError) as refused:
+        container.check_store(store)
+    assert str(chunk) in refused.value.where

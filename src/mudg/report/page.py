@@ -334,7 +334,7 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
         "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""), "better": better,
         "label": f"{metric['title']} over the lateral shift, {better}", "left": left, "right": right, "bottom": bottom,
         "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
-        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts],
+        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts], "to_left": shifts[-1] > 0, "to_right": shifts[0] < 0,
         "lines": [{"method": m, "points": [(x(s), y(v)) for s, v in line]} for m, line in points.items()],
     }  # fmt: skip
 

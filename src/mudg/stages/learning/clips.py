@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -12,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mudg.base import log, seeds
+from mudg.base import log, seeds, store
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.processes import calls_beside, run_in_processes
@@ -82,6 +83,9 @@ def making_clips(config: LearnConfig, folder: Path, points_alone: bool = False) 
         clip_shards.clips_at(clip_shards.shard_path(folder, number))  # a damaged one is found before the training begins
     if not missing or config.compute.workers == 0:
         return contextlib.nullcontext()
+    store.make_folder(folder)
+    if not os.access(folder, os.W_OK):
+        raise ResourceError("training clips cannot be written here", where=str(folder), remedy="choose another --data.clips")
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {config.compute.workers} processes")
     make = city_fits.write_fitted_city if rules.fitted else from_city.write_city
     return calls_beside(make, [(rules, n, folder) for n in missing], config.compute.workers)

@@ -37,6 +37,9 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
         except InputError as error:
             log.warn(f"{folder}: {error.what}")
             unread.append(Unread(folder, error.what if not error.got else f"{error.what}: {error.got}"))
+        except PermissionError as error:
+            log.warn(f"{folder}: access was refused")
+            unread.append(Unread(folder, f"access was refused: {error.filename}"))
     if not shown:
         raise InputError(
             "no finished run to show", where=", ".join(str(one.folder) for one in unread[:4]),

@@ -89,7 +89,7 @@ def check_store(path: Path) -> None:
 
 
 def _members_of_folder(path: Path) -> dict[str, _StoredMember]:
-    files = [file for file in sorted(path.rglob("*")) if file.is_file()]
+    files = [store.regular(file) for file in sorted(path.rglob("*")) if not file.is_dir()]
     return {file.relative_to(path).as_posix(): _StoredMember(file, 0, file.stat().st_size) for file in files}
 
 

@@ -1,0 +1,129 @@
+"""A user who is not root, before files and folders that others have closed: errors in words, and what can go on goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import encodings.ascii  # noqa: F401
+import os
+import shutil
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import toy_views
+from test_gallery import run_of
+from toy_clips import tiny
+
+from mudg import cli
+from mudg.stages.config import LearnConfig
+from mudg.stages.learning import clips as learn_clips
+from mudg.stages.viewing import gallery
+
+NOBODY = 65534
+pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="users are those of Unix")
+
+
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """A temporary folder that everybody may enter and write to."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o777)
+    yield folder
+    for path in [folder, *folder.rglob("*")]:
+        path.chmod(0o777)
+    shutil.rmtree(folder)
+
+
+def as_nobody(work: Callable[[], object], said: Path) -> int:
+    """Do the work in a copy of this process that is not root's; returns its exit code. What it says on stderr goes to a file."""
+    child = os.fork()
+    if child == 0:
+        code = 99
+        try:
+            with said.open("w") as file, contextlib.redirect_stderr(file):
+                if os.geteuid() == 0:
+                    os.setgroups([])
+                    os.setresgid(NOBODY, NOBODY, NOBODY)
+                    os.setresuid(NOBODY, NOBODY, NOBODY)
+                found = work()
+                code = found if isinstance(found, int) else 0
+        finally:
+            if code == 99:
+                traceback.print_exc()
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def closed_folder(root: Path) -> list[str]:
+    (root / "scene").chmod(0)
+    return ["fuse", str(root / "scene"), "--out", str(root / "out")]
+
+
+def closed_file(root: Path) -> list[str]:
+    (root / "scene" / "scene.json").chmod(0)
+    return ["fuse", str(root / "scene"), "--out", str(root / "out")]
+
+
+def closed_image(root: Path) -> list[str]:
+    next((root / "scene" / "images" / "front").iterdir()).chmod(0)
+    return ["fuse", str(root / "scene"), "--out", str(root / "out")]
+
+
+def closed_output(root: Path) -> list[str]:
+    (root / "closed").mkdir()
+    (root / "closed").chmod(0o555)
+    return ["fuse", str(root / "scene"), "--out", str(root / "closed" / "out")]
+
+
+def closed_settings(root: Path) -> list[str]:
+    (root / "fuse.yaml").write_text("voxel_m: 0.2\n")
+    (root / "fuse.yaml").chmod(0)
+    return ["fuse", str(root / "scene"), "--config", str(root / "fuse.yaml"), "--out", str(root / "out")]
+
+
+@pytest.mark.parametrize(
+    ("close", "code", "words"),
+    [
+        (closed_folder, 5, "access to a file was refused"),
+        (closed_file, 3, "file cannot be read"),
+        (closed_image, 3, "file cannot be read"),
+        (closed_output, 5, "cannot create a folder"),
+        (closed_settings, 3, "file cannot be read"),
+    ],
+)
+def test_what_is_closed_is_said(close: Callable[[Path], list[str]], code: int, words: str, open_folder: Path, tmp_path: Path) -> None:
+    toy_views.write_scene(open_folder / "scene", lidar=True)
+    for scene in ("scene", "none"):  # what it imports may lie where nobody else reads
+        cli.main(["fuse", str(open_folder / scene), "--out", str(tmp_path / "out")])
+    command = close(open_folder)
+    assert as_nobody(lambda: cli.main(command), tmp_path / "said") == code
+    said = (tmp_path / "said").read_text()
+    assert words in said and "Permission denied" in said and "Traceback" not in said
+
+
+def test_a_closed_folder_is_listed_and_the_other_runs_are_shown(open_folder: Path, tmp_path: Path) -> None:
+    run_of(open_folder / "runs" / "good")
+    gallery.run([open_folder / "runs", tmp_path / "none"], tmp_path / "all.html")  # what it imports may lie where nobody else reads
+    run_of(open_folder / "runs" / "closed").chmod(0)
+    (open_folder / "pages").mkdir()
+    (open_folder / "pages").chmod(0o777)
+    page = open_folder / "pages" / "all.html"
+    assert as_nobody(lambda: gallery.run([open_folder / "runs"], page) and None, tmp_path / "said") == 0
+    assert "access was refused" in page.read_text() and "1 finished runs" in page.read_text()
+
+
+def test_clips_that_cannot_be_written_are_refused_before_any_is_made(open_folder: Path, tmp_path: Path) -> None:
+    (open_folder / "clips").mkdir()
+    (open_folder / "clips").chmod(0o555)
+    config: LearnConfig = tiny(open_folder / "clips", workers=1)
+
+    def begin() -> int:
+        try:
+            with learn_clips.making_clips(config, open_folder / "clips"):
+                return 0
+        except learn_clips.ResourceError as error:
+            return error.exit_code
+
+    assert as_nobody(begin, tmp_path / "said") == 5
