@@ -173,7 +173,8 @@ def stopped_command(
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
 @pytest.mark.parametrize(
-    ("number", "group", "code"), [(signal.SIGTERM, False, 143), pytest.param(signal.SIGINT, False, 130, marks=pytest.mark.slow), (signal.SIGINT, True, 130)]
+    ("number", "group", "code"),
+    [(signal.SIGTERM, False, 143), pytest.param(signal.SIGINT, False, 130, marks=pytest.mark.slow), (signal.SIGINT, True, 130)],
 )
 def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int, group: bool, code: int) -> None:
     got, said, workers = stopped_command(tmp_path, number, group=group)
