@@ -40,7 +40,7 @@ def log(tmp_path_factory):
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
     fit.run(fit_config(method="street_gaussians", iterations=30, start__gaussians=8000), root / "scene", root / "fuse", root / "fit")
     before = files.load("embedded-tiny")
-    files.save(extended(before, replace(before.config, renders=True)), root / "tiny", "", {})
+    files.save(extended(before, replace(before.config, renders=True, area_px=96 * 64)), root / "tiny", "", {})
     return root
 
 
