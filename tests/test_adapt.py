@@ -165,6 +165,7 @@ def test_a_model_that_gains_nothing_is_not_taken(log, tmp_path):
     assert weights_of(tmp_path / "out" / "model") == weights_of(log / "tiny")
 
 
+@pytest.mark.slow
 def test_held_out_frames_are_never_read(log, result, tmp_path):
     damaged = tmp_path / "scene"
     shutil.copytree(log / "scene", damaged)
