@@ -88,9 +88,10 @@ def _no_network() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def _no_waiting_for_the_disk() -> Iterator[None]:
     """No test cuts the power: what the system has taken is read back, also by other processes and after a kill."""
-    fsync, os.fsync = os.fsync, lambda _fd: None
+    before = os.fsync, os.sync
+    os.fsync, os.sync = (lambda _fd: None), (lambda: None)
     yield
-    os.fsync = fsync
+    os.fsync, os.sync = before
 
 
 @pytest.fixture(autouse=True)
