@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-# Set before any test imports torch: tests are many and small, and results must not depend on the machine's core count.
-for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+# Set before any test imports torch: tests are many and small, workers share the cores, and results must not depend on their number.
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MUDG_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("NO_COLOR", "1")
 os.environ.setdefault("COLUMNS", "120")
@@ -88,9 +88,10 @@ def _no_network() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def _no_waiting_for_the_disk() -> Iterator[None]:
     """No test cuts the power: what the system has taken is read back, also by other processes and after a kill."""
-    fsync, os.fsync = os.fsync, lambda _fd: None
+    before = os.fsync, os.sync
+    os.fsync, os.sync = (lambda _fd: None), (lambda: None)
     yield
-    os.fsync = fsync
+    os.fsync, os.sync = before
 
 
 @pytest.fixture(autouse=True)

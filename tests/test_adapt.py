@@ -37,7 +37,7 @@ def log(tmp_path_factory):
     fuse.run(FuseConfig(), root / "scene", root / "fuse")
     fit.run(fit_config(method="street_gaussians", iterations=30, start__gaussians=8000), root / "scene", root / "fuse", root / "fit")
     before = files.load("embedded-tiny")
-    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
+    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=SIZE[0] * SIZE[1])
     files.save(extended(before, grown), root / "tiny", "", {})
     return root
 
@@ -165,6 +165,7 @@ def test_a_model_that_gains_nothing_is_not_taken(log, tmp_path):
     assert weights_of(tmp_path / "out" / "model") == weights_of(log / "tiny")
 
 
+@pytest.mark.slow
 def test_held_out_frames_are_never_read(log, result, tmp_path):
     damaged = tmp_path / "scene"
     shutil.copytree(log / "scene", damaged)

@@ -35,7 +35,10 @@ def saved(tmp_path: Path, network: str) -> Path:
     return tmp_path / "published.pth"
 
 
-@pytest.mark.parametrize("network", STATES)
+LARGE = {"inception", "i3d"}
+
+
+@pytest.mark.parametrize("network", [pytest.param(one, marks=pytest.mark.slow) if one in LARGE else one for one in STATES])
 def test_converted_weights_are_the_published_ones_under_known_names(tmp_path: Path, network: str) -> None:
     checkpoint = saved(tmp_path, network)
     converted.convert_weights(network, checkpoint, tmp_path / "out")
@@ -62,6 +65,7 @@ def test_unknown_names_of_i3d_are_matched_by_order_and_shape() -> None:
     assert set(i3d.with_known_names(dict(list(strange.items())[1:]))) == set(strange) - {"layer0"}  # one is missing: no guess
 
 
+@pytest.mark.slow
 def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = saved(tmp_path, "inception")
     converted.convert_weights("inception", checkpoint, tmp_path / "out")

@@ -31,13 +31,6 @@ POINTS = int(os.environ.get("MUDG_TEST_POINTS", "24"))
 """At how many operations of each verb it is stopped; a number above all of them means at every one."""
 
 
-@pytest.fixture(autouse=True)
-def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A killed process loses nothing that the system has; only a power failure would."""
-    monkeypatch.setattr(os, "fsync", lambda _fd: None)
-    monkeypatch.setattr(os, "sync", lambda: None)
-
-
 def small_run(out: Path, value: int = 1, *, overwrite: bool = False) -> Path:
     """A verb in small: files, a log, sub-folders; it continues where it stopped."""
     run = RunDir.open(out, OUTPUT, {"value": value}, {}, overwrite)

@@ -61,6 +61,7 @@ def test_tensors_and_values_are_those_of_the_published_files() -> None:
     assert learned == 12_697_264
 
 
+@pytest.mark.slow
 def test_both_layouts_give_equal_features_and_the_epsilon_matters(state) -> None:
     clip = torch.rand(1, 3, 9, 224, 224, generator=torch.Generator().manual_seed(1)) * 2 - 1
     with torch.no_grad():

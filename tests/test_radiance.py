@@ -262,6 +262,7 @@ def test_a_short_fit_lowers_its_losses(world):
         assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
 
 
+@pytest.mark.slow
 def test_a_step_on_another_device_is_the_same(world):
     with pretend_device() as there:
         state, config = started(world, there, **FEW_RAYS)

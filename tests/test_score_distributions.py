@@ -217,7 +217,7 @@ def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
         score.run(ScoreConfig(fid_weights=str(inside)), scene, views, tmp_path / "score")
 
 
-@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize("suffix", [pytest.param(".pth", marks=pytest.mark.slow), ".safetensors"])
 def test_the_network_itself_from_a_file(tmp_path: Path, suffix: str) -> None:
     state = toy_inception.state()
     path = tmp_path / f"weights{suffix}"

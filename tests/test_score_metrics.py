@@ -333,7 +333,7 @@ def torchvision_trunk(name):
     return torch.nn.Sequential(*layers), (1, 4, 7, 9, 10, 11, 12)
 
 
-@pytest.mark.parametrize("name", ["vgg", "squeeze"])
+@pytest.mark.parametrize("name", [pytest.param("vgg", marks=pytest.mark.slow), "squeeze"])
 @pytest.mark.parametrize("given", ["correct", "unscaled"])
 def test_lpips_with_vgg_and_squeeze_equals_its_float64_twin(pictures, name, given):
     state, truth = lpips_state(name), pictures[0][:, :70, :75]
