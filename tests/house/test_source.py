@@ -112,7 +112,8 @@ CONNECTS = {
     "torch.hub",
 }  # fmt: skip
 CONNECTING = {
-    "base/location.py": {"fsspec", "ssl"}, "stages/batches/engines.py": {"ray", "submitit"}, "stages/learning/parallel.py": {"torch.distributed"},
+    "base/location.py": {"fsspec", "ssl"}, "stages/batches/engines.py": {"ray", "submitit"},
+    "stages/learning/parallel.py": {"torch.distributed"},
     "stages/viewing/server.py": {"http"}, "stages/viewing/view.py": {"http"},
 }  # fmt: skip
 """Modules that may reach a network, and what of. SECURITY.md tells when they do."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from mudg.base.errors import plain
 from mudg.base.memory import in_words
-from mudg.stages.batches.records import BatchFolder, Ended, CorpusFacts
+from mudg.stages.batches.records import BatchFolder, CorpusFacts, Ended
 from mudg.stages.batches.work import REASONS
 
 _WINDOW_S: Final = 3600.0

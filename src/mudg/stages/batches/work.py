@@ -34,7 +34,7 @@ from mudg.base.usage import folder_bytes
 from mudg.stages.batches.child import ASKED_TO_STOP, KILLED, Ending, Stop, run_step
 from mudg.stages.batches.inputs import InputStore
 from mudg.stages.batches.plan import REVISION, BatchPlan, Entry, Unit, command_of
-from mudg.stages.batches.records import BatchFolder, Ended, CorpusFacts
+from mudg.stages.batches.records import BatchFolder, CorpusFacts, Ended
 
 DONE, FAILED, STOPPED = "done", "failed", "stopped"
 REASONS: Final[Mapping[int, str]] = {
