@@ -30,7 +30,7 @@ SCENES = 200
 RAY = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled"}
 STEP = """#!/bin/sh
 # step.sh NAME OUT TALLY: writes a small result, and a line per run
-echo "$1" >> "$3/$1"
+echo "on node $RAY_RAYLET_PID" >> "$3/$1"
 sleep ${STEP_S:-0.02}
 mkdir -p "$2" && echo "result of $1" > "$2/result.txt"
 case $1 in *13) echo "error: it is cut off" >&2; exit 3;; esac
@@ -169,7 +169,8 @@ def test_a_node_of_ray_that_goes_down(tmp_path: Path, monkeypatch: pytest.Monkey
         doomed = cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
         running = made.start(out, "--engine", "ray", "--ray-address", cluster.address, STEP_S="0.5", **RAY)
-        wait_until(lambda: made.runs() >= 8, 180)
+        nodes = lambda: {line for path in made.tallies() for line in path.read_text().splitlines()}  # noqa: E731
+        wait_until(lambda: len(nodes()) == 2, 180)
         cluster.remove_node(doomed, allow_graceful=False)
         assert running.wait(400) == 11
     finally:

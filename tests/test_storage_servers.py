@@ -31,6 +31,7 @@ from mudg.stages.batches.records import BatchFolder
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # warnings of the servers' own packages
 
 SERVERS = dict(one.split("=", 1) for one in os.environ.get("MUDG_TEST_S3", "").split(",") if one)
+CITY = ("--city.n-frames", "2", "--city.width", "48", "--city.height", "32", "--city.cameras", "front", "--no-contact-sheet")
 CONDITIONAL = {"moto": True, "rclone": False}
 
 
@@ -179,23 +180,12 @@ def test_failures_in_words(server: str, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_commands_from_store_to_store(root: Location, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    city = (
-        "--city.n-frames",
-        "2",
-        "--city.width",
-        "48",
-        "--city.height",
-        "32",
-        "--city.cameras",
-        "front",
-        "--no-contact-sheet",
-    )
     scratch = ("--scratch", str(tmp_path / "scratch"), "--quiet")
-    assert app.main(["ingest", "city", str(root / "city"), *city, *scratch]) == 0
+    assert app.main(["ingest", "city", str(root / "city"), *CITY, *scratch]) == 0
     fuse = ["fuse", str(root / "city"), "--out", str(root / "fused"), *scratch]
     assert app.main([*fuse, "--json"]) == 0
     assert json.loads(capfd.readouterr().out.partition("\n")[2]) == {"fused": str(root / "fused")}
-    assert app.main(["ingest", "city", str(tmp_path / "city"), *city, "--quiet"]) == 0
+    assert app.main(["ingest", "city", str(tmp_path / "city"), *CITY, "--quiet"]) == 0
     assert app.main(["fuse", str(tmp_path / "city"), "--out", str(tmp_path / "fused"), "--quiet"]) == 0
     (root / "fused").fetch(tmp_path / "back")
     assert store.digest(tmp_path / "back") == store.digest(tmp_path / "fused")
@@ -428,57 +418,13 @@ def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> Non
 
 def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) -> None:
     """Real steps give the same bytes in a store and on this machine."""
-    city = (
-        "--city.n-frames",
-        "2",
-        "--city.width",
-        "48",
-        "--city.height",
-        "32",
-        "--city.cameras",
-        "front",
-        "--no-contact-sheet",
-    )
     digests = []
     for place, machine in ((Location.of(tmp_path / "here"), "one"), (root, "two")):
+        scratch = ("--quiet", "--scratch", str(tmp_path / machine))
         for seed in ("1", "2"):
-            scene = str(place / f"scenes/c{seed}")
-            assert (
-                app.main(
-                    [
-                        "ingest",
-                        "city",
-                        scene,
-                        *city,
-                        "--city.seed",
-                        seed,
-                        "--quiet",
-                        "--scratch",
-                        str(tmp_path / machine),
-                    ]
-                )
-                == 0
-            )
+            assert app.main(["ingest", "city", str(place / f"scenes/c{seed}"), *CITY, "--city.seed", seed, *scratch]) == 0
         (place / "list.txt").save(b"scenes/c1\nscenes/c2\n")
-        words = [
-            "batch",
-            "run",
-            "--list",
-            str(place / "list.txt"),
-            "--out",
-            str(place / "runs"),
-            "--stages",
-            "fuse",
-            "--jobs",
-            "1",
-        ]
-        assert (
-            app.main(
-                [*words, "--bounds", "fuse.json:points_static>=1", "--quiet", "--scratch", str(tmp_path / machine)]
-            )
-            == 0
-        )
-        folder = BatchFolder(place / "runs")
-        records = [json.loads(folder.done(key).load()) for key in folder.keys("done")]
-        digests.append({record["scene"]: record["digest"] for record in records})
+        words = ["batch", "run", "--list", str(place / "list.txt"), "--out", str(place / "runs"), "--stages", "fuse", "--jobs", "1"]
+        assert app.main([*words, *scratch]) == 0
+        digests.append({record.scene: record.digest for record in BatchFolder(place / "runs").records("done")})
     assert digests[0] == digests[1] and len(digests[0]) == 2

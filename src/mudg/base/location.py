@@ -78,15 +78,18 @@ def _file_system(scheme: str, process: int) -> Any:
     package, extra = PACKAGES[scheme]
     options: dict[str, Any] = {} if scheme == "memory" else {"use_listings_cache": False, "skip_instance_cache": True}
     if package == "s3fs":
-        limits = {"connect_timeout": 10, "read_timeout": 60, "retries": {"total_max_attempts": 2}}  # s3fs itself repeats five times
+        limits = {"connect_timeout": 10, "read_timeout": 60, "retries": {"total_max_attempts": 6, "mode": "standard"}}
         options |= {"max_concurrency": 1, "config_kwargs": limits}
     try:
         import fsspec
 
-        return fsspec.filesystem(scheme, **options)
+        found = fsspec.filesystem(scheme, **options)
     except ImportError as error:
         raise ResourceError(f"a package for {scheme}:// is missing", expected=package, got=str(error).split("\n")[0],
             remedy=f"pip install 'mudg[{extra}]'") from error  # fmt: skip
+    if package == "s3fs":
+        found.retries = 2  # of what botocore has repeated already
+    return found
 
 
 # failures in words ----------------------------------------------------------------------------------------------------

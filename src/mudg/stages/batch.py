@@ -97,7 +97,7 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
         return {**counts, "left": left, "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"}
     job = Job(folder, plan, max(1, round(asked.batch.cpus)), asked.batch.grace_s, _absolute(asked.scratch))
     with folder.owned(part, numbered=asked.shard.startswith("env"), take_over=asked.take_over) as owner:
-        if asked.batch.engine == "slurm":
+        if asked.batch.engine == "slurm" and entries:
             number, messages = engines.submit_to_slurm(job, entries, asked.batch)
             me = next(one for one in folder.owners().values() if one.process == os.getpid())
             owner.save(me.model_copy(update={"job": number}).model_dump_json().encode())

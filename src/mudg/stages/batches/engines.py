@@ -12,7 +12,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.stages.batches.child import Stop
-from mudg.stages.batches.plan import REVISION, Entry, shard
+from mudg.stages.batches.plan import REVISION, Entry
 from mudg.stages.batches.work import Job, Report, run_scene
 from mudg.stages.config.batch import BatchConfig
 
@@ -82,7 +82,8 @@ class LocalRun:
                 except KeyboardInterrupt:
                     self.stop.ask()
                 raise
-        self.job.inputs.clear()
+            finally:
+                self.job.inputs.clear()
 
     def wait(self) -> None:
         """Wait until no step runs."""
@@ -194,7 +195,6 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
     store.make_folder(folder)
     folder.chmod(0o700)  # tasks are pickles that nobody else may write
     count = max(1, min(batch.jobs or 1, len(entries)))
-    parts = [part for index in range(count) if (part := shard(entries, (index, count)))]
     try:
         executor = submitit.AutoExecutor(folder=folder / "%j", cluster="slurm", slurm_max_num_timeout=1000)
         executor.update_parameters(
@@ -203,7 +203,7 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
             **({"mem_gb": batch.memory_gb} if batch.memory_gb else {}), **({"gpus_per_node": round(batch.gpus)} if batch.gpus else {}),
         )  # fmt: skip
         with executor.batch():
-            tasks = [executor.submit(SlurmTask(replace(job, threads=max(1, round(batch.cpus))), part)) for part in parts]
+            tasks = [executor.submit(SlurmTask(job, entries[index::count])) for index in range(count)]
     except (RuntimeError, submitit.core.utils.FailedJobError, OSError) as error:
         raise ResourceError("Slurm refused, or is not on this machine", where="sbatch", got=str(error).strip()[:500],
             remedy="run this on a login node, or take another --engine") from error  # fmt: skip

@@ -59,12 +59,8 @@ def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
     """
     place = Location.of(listed)
     if place.local is not None and place.local.is_dir():
-        lines = [
-            (str(entry), shlex.quote(entry.name))
-            for entry in sorted(place.local.iterdir())
-            if not _LEFT_OUT.fullmatch(entry.name)
-        ]
-        folder = place.text
+        names = sorted(path.name for path in place.local.iterdir() if not _LEFT_OUT.fullmatch(path.name))
+        lines, folder = [(str(place.local / name), shlex.quote(name)) for name in names], place.text
     else:
         text = place.load().decode("utf-8", "replace")
         lines = [(f"{place}: line {index + 1}", line) for index, line in enumerate(text.splitlines())]
@@ -75,10 +71,8 @@ def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
     sources: dict[str, str] = {}
     for entry in entries:
         if entry.name in sources:
-            raise InputError(
-                "two entries would write the same folder", where=str(place), got=f"{sources[entry.name]} and {entry.source}",
-                remedy=f"give one of them another name: SOURCE name={entry.name}-2",
-            )  # fmt: skip
+            raise InputError("two entries would write the same folder", where=str(place), got=f"{sources[entry.name]} and {entry.source}",
+                remedy=f"give one of them another name: SOURCE name={entry.name}-2")  # fmt: skip
         sources[entry.name] = entry.source
     return entries
 
@@ -163,34 +157,19 @@ REVISION: Final = "revision"
 """Setting of a line that only changes the key: another content at the same address."""
 
 
-@dataclass(frozen=True)
-class StageRule:
-    """How a step is called.
-
-    Args:
-        words: words after ``mudg``; ``{source}`` and names of other steps in braces stand for folders. needs: steps it reads, each
-            the first one of its group that is part of the batch; ``scene`` is the source itself, if it is none of them.
-        group: settings it takes (empty: all of them).
-    """
-
-    words: tuple[str, ...]
-    needs: tuple[tuple[str, ...], ...] = ()
-    group: str = ""
-
-
-_SCENE: Final = ("annotate", "ingest")
-STAGE_RULES: Final[Mapping[str, StageRule]] = {
-    "run": StageRule(("run", "{source}")),
-    "ingest": StageRule(("ingest", "{source}"), (), "ingest"),
-    "annotate": StageRule(("annotate", "{scene}"), (("ingest",),), "annotate"),
-    "fuse": StageRule(("fuse", "{scene}"), (_SCENE,), "fuse"),
-    "fit": StageRule(("fit", "{scene}", "--fused", "{fuse}", "--method", "street_gaussians"), (_SCENE, ("fuse",)), "fit"),
-    "synthesize": StageRule(
-        ("synthesize", "{scene}", "--fused", "{fuse}", "--fitted", "{fit}"), (_SCENE, ("fuse",), ("fit",)), "synthesize"
-    ),
-    "render": StageRule(("render", "{scene}", "--model", "{fit}"), (_SCENE, ("fit",)), "render"),
-    "score": StageRule(("score", "{scene}", "--fused", "{fuse}", "--views", "fit={render}"), (_SCENE, ("fuse",), ("render",)), "score"),
-}  # fmt: skip
+STAGES: Final[Mapping[str, str]] = {
+    "run": "run {source}",
+    "ingest": "ingest {source}",
+    "annotate": "annotate {scene}",
+    "fuse": "fuse {scene}",
+    "fit": "fit {scene} --fused {fuse} --method street_gaussians",
+    "synthesize": "synthesize {scene} --fused {fuse} --fitted {fit}",
+    "render": "render {scene} --model {fit}",
+    "score": "score {scene} --fused {fuse} --views fit={render}",
+}
+"""Words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}`` for that of annotate or ingest,
+or for the source."""
+_PLACEHOLDER: Final = re.compile(r"\{(\w+)\}")
 COMMAND: Final = "command"
 """Name of the step that is a program of the user's own."""
 
@@ -254,9 +233,7 @@ class BatchPlan:
             yield unit
 
 
-@functools.cache
-def _version() -> str:
-    return version()
+_version = functools.cache(version)
 
 
 def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
@@ -282,22 +259,22 @@ def plan_of(names: Sequence[str], settings: Mapping[str, Any], command: Sequence
             names = (*names, COMMAND)
         if "{out}" not in " ".join(command):
             raise UsageError("a command must be told where to write", where="--command", expected="{out} among its words")
-    known = {*STAGE_RULES, *([COMMAND] if command else [])}
-    for name in names:
-        if name not in known:
-            raise UsageError("there is no such step", where="--stages", got=name, expected=", ".join(STAGE_RULES))
-    if len(set(names)) < len(names) or not names:
-        raise UsageError("each step at most once, and at least one", where="--stages", got=" ".join(names))
+    known = {**{name: words.split() for name, words in STAGES.items()}, **({COMMAND: list(command)} if command else {})}
     stages: list[BatchStage] = []
     for name in names:
+        if name not in known:
+            raise UsageError("there is no such step", where="--stages", got=name, expected=", ".join(STAGES))
         made = [stage.name for stage in stages]
-        if name == COMMAND:
-            words = tuple(command)
-            stages.append(BatchStage(name, words, tuple(one for one in made if "{" + one + "}" in " ".join(words))))
-            continue
-        rule = STAGE_RULES[name]
-        own = dict(settings[rule.group] if rule.group else settings)
-        stages.append(BatchStage(name, _words(rule, made, name), _needs(rule, made, name), own))
+        scene = next((one for one in ("annotate", "ingest") if one in made), "source")
+        words = tuple(word if name == COMMAND else word.replace("{scene}", "{" + scene + "}") for word in known[name])
+        read = set(_PLACEHOLDER.findall(" ".join(words)))
+        missing = (read & set(STAGES)) - set(made)
+        if missing and name != COMMAND:
+            raise UsageError(f"the step {name} needs {' and '.join(sorted(missing))} before it", where="--stages", got=" ".join(names))
+        own = {} if name == COMMAND else dict(settings if name == "run" else settings[name])
+        stages.append(BatchStage(name, words, tuple(one for one in made if one in read), own))
+    if len(set(names)) < len(names) or not names:
+        raise UsageError("each step at most once, and at least one", where="--stages", got=" ".join(names))
     return BatchPlan(tuple(stages))
 
 
@@ -307,24 +284,6 @@ def listed_plan(verb: str, settings: Mapping[str, Any], overwrite: bool) -> Batc
     return BatchPlan((BatchStage(verb, words, (), settings, direct=True),))
 
 
-def _needs(rule: StageRule, made: Sequence[str], name: str) -> tuple[str, ...]:
-    found = []
-    for group in rule.needs:
-        first = next((one for one in group if one in made), None)
-        if first is not None:
-            found.append(first)
-        elif not set(group) & set(_SCENE):
-            raise UsageError(f"the step {name} needs {' or '.join(group)} before it", where="--stages", got=" ".join((*made, name)))
-    return tuple(found)
-
-
-def _words(rule: StageRule, made: Sequence[str], name: str) -> tuple[str, ...]:
-    """The step's command, ``{scene}`` replaced by the step that makes the scene, or by the source."""
-    candidates = _SCENE if name != "annotate" else ("ingest",)
-    scene = next((one for one in candidates if one in made), "source")
-    return tuple(word.replace("{scene}", "{" + scene + "}") for word in rule.words)
-
-
 def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:
     """The command line of a step of a scene.
 
@@ -332,7 +291,7 @@ def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> 
         places: ``source`` and steps -> where they lie. out: folder to write. config: file of its settings, if it has any.
     """
     filled = {**places, "out": out, "name": unit.entry.name}
-    words = [_filled(word, filled) for word in unit.stage.words]
+    words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in unit.stage.words]
     if unit.stage.is_own:
         return words
     groups = {"ingest": "", "run": "ingest."}
@@ -349,9 +308,3 @@ def line_words(settings: Mapping[str, str], group: str = "") -> Iterator[str]:
             yield f"--{group}city.seed={value}"
         elif name in OF_A_LINE:
             yield f"--{group}{name}={value}"
-
-
-def _filled(word: str, values: Mapping[str, str]) -> str:
-    for name, value in values.items():
-        word = word.replace("{" + name + "}", value)
-    return word
