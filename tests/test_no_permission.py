@@ -16,7 +16,7 @@ import toy_views
 from test_gallery import run_of
 from toy_clips import tiny
 
-from mudg import cli
+from mudg import app
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.viewing import gallery
@@ -96,9 +96,9 @@ def closed_settings(root: Path) -> list[str]:
 def test_what_is_closed_is_said(close: Callable[[Path], list[str]], code: int, words: str, open_folder: Path, tmp_path: Path) -> None:
     toy_views.write_scene(open_folder / "scene", lidar=True)
     for scene in ("scene", "none"):  # what it imports may lie where nobody else reads
-        cli.main(["fuse", str(open_folder / scene), "--out", str(tmp_path / "out")])
+        app.main(["fuse", str(open_folder / scene), "--out", str(tmp_path / "out")])
     command = close(open_folder)
-    assert as_nobody(lambda: cli.main(command), tmp_path / "said") == code
+    assert as_nobody(lambda: app.main(command), tmp_path / "said") == code
     said = (tmp_path / "said").read_text()
     assert words in said and "Permission denied" in said and "Traceback" not in said
 
