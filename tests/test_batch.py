@@ -95,6 +95,7 @@ def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.Captur
     assert written["counts"] == {"done": 1, "reused": 0, "failed": 3}
 
 
+@pytest.mark.slow
 def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("one", "two"):
         made.write_raw_drive(tmp_path / name)

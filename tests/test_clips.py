@@ -332,6 +332,7 @@ def test_half_of_the_clips_on_the_path_have_points_of_other_frames():
     assert 0.4 < np.mean(np.array(drawn) == 0.0) < 0.6
 
 
+@pytest.mark.slow
 def test_city_clips_with_the_condition_of_freevs():
     rules = from_city.CityClipRules(48, 32, window=1, clips=1, near_points=True)
     clips_of = from_city.make_clips(rules, 7)

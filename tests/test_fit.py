@@ -379,7 +379,7 @@ def test_fused_points_give_depth_beside_the_path(world):
 
 
 def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path):
-    usual = settings("mudg_s", iterations=14, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
+    usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [
         fit.run(replace(usual, virtual=replace(usual.virtual, **changes)), world["scene"], world["fuse"], tmp_path / str(n),
                 observations=world["virtual"])

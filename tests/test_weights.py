@@ -290,6 +290,7 @@ def test_towers_can_come_from_another_file(tmp_path, whole, complete):
     assert all(torch.equal(value, joined[name]) for name, value in plain.items())
 
 
+@pytest.mark.slow
 def test_conversion_in_its_own_process(tmp_path, complete):
     """The way of the command line: a fresh process with a memory limit."""
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
