@@ -305,3 +305,17 @@ def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.Mon
     large = written(out).stat().st_size
     monkeypatch.setattr(run_report, "BUDGET_BYTES", 1000)
     assert written(out).stat().st_size < large
+
+
+@pytest.mark.parametrize(
+    ("shifts_m", "left", "right"), [((0.0, 2.0), "left", "m"), ((0.0, -2.0), "", "right, m"), ((-2.0, 2.0), "left", "right, m")]
+)
+def test_a_chart_names_the_sides_that_it_shows(shifts_m: tuple[float, ...], left: str, right: str) -> None:
+    scores = {
+        "methods": [{"name": "a"}], "trajectories": [{"name": str(s), "shift_m": s} for s in shifts_m],
+        "results": [{"method": "a", "trajectory": str(s), "values": {"psnr": 20.0 + s}} for s in shifts_m],
+    }  # fmt: skip
+    figure = report_page._chart(scores, {"name": "psnr", "title": "PSNR", "unit": "dB", "better": "higher"})
+    drawn = report_html._environment().from_string('{% from "macros.html.j2" import chart %}{{ chart(figure) }}').render(figure=figure)
+    words = re.findall(r"<text [^>]*>(left|right, m|m)</text>", drawn)
+    assert words == [word for word in (left, right) if word]
