@@ -22,8 +22,8 @@ from toy_scene import ToyStreet
 from mudg import cli
 from mudg.base import store
 from mudg.base.errors import UsageError
-from mudg.bench import run as bench
 from mudg.bench import chain, page
+from mudg.bench import run as bench
 from mudg.core import trajectory
 from mudg.data.city import CityConfig
 from mudg.data.scene import read_scene, write_zip
