@@ -91,7 +91,7 @@ class LocalRun:
         concurrent.futures.wait(self._threads)
 
     def _fetch_ahead(self, entry: Entry, waiting: Sequence[Entry]) -> None:
-        """Begin to fetch the log of the next scene, once that of this one is here."""
+        """Wait for the log of this scene, if it is under way, and begin to fetch that of the next one."""
         thread = self._ahead.pop(entry.name, None)
         while thread is not None and thread.is_alive() and not self.stop.asked:
             thread.join(0.2)
