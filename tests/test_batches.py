@@ -24,8 +24,8 @@ from mudg.stages.batches import engines, status, work
 from mudg.stages.batches.child import Stop, last_words, run_step
 from mudg.stages.batches.engines import LocalRun
 from mudg.stages.batches.plan import BatchPlan, BatchStage, Entry, command_of, parse_shard, plan_of, read_list, shard_of
-from mudg.stages.batches.records import BatchFolder, this_host
-from mudg.stages.batches.work import Job, Report, facts_of
+from mudg.stages.batches.records import BatchFolder, Ended, this_host
+from mudg.stages.batches.work import Job, facts_of
 from mudg.stages.config import BatchConfig, RunConfig
 
 STEP = """
@@ -55,7 +55,7 @@ class Scenes:
     def run(self, jobs: int = 1, scratch: Path | None = None, threads: int = 1, stop: Stop | None = None) -> dict[str, int]:
         """Run what is missing; how many steps ended how."""
         self.batch.begin(self.plan, self.entries)
-        reports: list[Report] = []
+        reports: list[Ended] = []
         job = Job(self.batch, self.plan, threads, grace_s=5.0, scratch=scratch)
         done, failed = self.batch.keys("done"), self.batch.keys("failed")
         entries = [entry for entry in self.entries if work.is_open(self.plan, entry, done, failed)]
@@ -560,62 +560,30 @@ def test_paths_in_settings_are_made_absolute(tmp_path: Path, monkeypatch: pytest
 # ---- templates for schedulers -------------------------------------------------------------------------------------------
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs/examples"
-ANY = object()
-KUBERNETES = {
-    "apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": str},
-    "spec": {
-        "completionMode": "Indexed", "completions": int, "parallelism": int, "backoffLimitPerIndex": int, "maxFailedIndexes": int,
-        "podFailurePolicy": {"rules": [{"action": str, "onExitCodes?": {"containerName": str, "operator": str, "values": [int]},
-                                        "onPodConditions?": [{"type": str}]}]},
-        "template": {"spec": {
-            "restartPolicy": "Never", "terminationGracePeriodSeconds": int, "serviceAccountName": str,
-            "containers": [{"name": str, "image": str, "command": [str], "args": [str], "resources": {"requests": ANY, "limits": ANY},
-                            "volumeMounts": [{"name": str, "mountPath": str}]}],
-            "volumes": [{"name": str, "emptyDir": {}}],
-        }},
-    },
-}  # fmt: skip
-SKYPILOT = {
-    "name": str, "num_nodes": int, "envs": {"LIST": str, "OUT": str}, "setup": str, "run": str,
-    "resources": {"cpus": str, "memory": str, "disk_size": int, "use_spot": bool,
-                  "job_recovery": {"strategy": str, "max_restarts_on_errors": int}},
-}  # fmt: skip
 
 
-def differs(found: object, schema: object, at: str = "") -> list[str]:
-    """What in a value does not follow a schema: mappings with these keys (? = may be absent), lists of these, types, or values."""
-    if schema is ANY:
-        return []
-    if isinstance(schema, type):
-        return [] if type(found) is schema else [f"{at}: {found!r}"]
-    if isinstance(schema, list):
-        return [p for i, one in enumerate(found) for p in differs(one, schema[0], f"{at}[{i}]")] if isinstance(found, list) else [at]
-    if isinstance(schema, dict):
-        if not isinstance(found, dict):
-            return [at]
-        known = {name.rstrip("?"): (name.endswith("?"), inner) for name, inner in schema.items()}
-        wrong = [f"{at}.{name}" for name in found if name not in known]
-        wrong += [f"{at}.{name} is missing" for name, (optional, _) in known.items() if not optional and name not in found]
-        return wrong + [p for name, inner in found.items() if name in known for p in differs(inner, known[name][1], f"{at}.{name}")]
-    return [] if found == schema else [f"{at}: {found!r}"]
-
-
-def test_templates_follow_their_schemas_and_start_a_batch() -> None:
+def test_templates_start_a_batch() -> None:
     import yaml
 
-    job = yaml.safe_load((EXAMPLES / "batch_kubernetes.yaml").read_text())
-    assert differs(job, KUBERNETES) == []
-    spec = job["spec"]
+    spec = yaml.safe_load((EXAMPLES / "batch_kubernetes.yaml").read_text())["spec"]
     pod, (container,) = spec["template"]["spec"], spec["template"]["spec"]["containers"]
+<<<<<<< HEAD
     words = [*container["command"], *container["args"]]
     parsed, _ = app.parse(words[1:])
     assert parsed.shard == f"env/{spec['completions']}"
+=======
+    parsed = cli.parse([*container["command"], *container["args"]][1:])
+    assert spec["completionMode"] == "Indexed" and parsed.shard == f"env/{spec['completions']}"
+>>>>>>> fleet
     assert pod["terminationGracePeriodSeconds"] > parsed.settings.grace_s
     rules = [rule["onExitCodes"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule]
     assert {rule["containerName"] for rule in rules} == {container["name"]}
     assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
     task = yaml.safe_load((EXAMPLES / "batch_skypilot.yaml").read_text())
-    assert differs(task, SKYPILOT) == []
     line = next(line for line in task["run"].splitlines() if line.startswith("mudg"))
+<<<<<<< HEAD
     assert app.parse(line.split()[1:])[0].shard == "env"
     assert differs({"a": 1, "c": "x"}, {"a": str, "b": int}) == [".c", ".b is missing", ".a: 1"]
+=======
+    assert cli.parse(line.split()[1:]).shard == "env"
+>>>>>>> fleet

@@ -88,21 +88,6 @@ def test_single_objects(root: Location, server: str) -> None:
     assert root.names() == ["a", "b"]
 
 
-def test_of_eight_threads_one_makes_each_object(root: Location, server: str) -> None:
-    if not CONDITIONAL[server]:
-        pytest.skip("this server has no conditional writes")
-    ready = threading.Barrier(8)
-
-    def claim(me: int) -> list[int]:
-        ready.wait()
-        return [n for n in range(40) if (root / f"claims/{n}").save(str(me).encode(), only_if_absent=True)]
-
-    with concurrent.futures.ThreadPoolExecutor(8) as pool:
-        won = list(pool.map(claim, range(8)))
-    assert sorted(n for names in won for n in names) == list(range(40))
-    assert all((root / f"claims/{n}").load() == str(me).encode() for me, names in enumerate(won) for n in names)
-
-
 def test_folders_with_large_objects_and_odd_names(root: Location, tmp_path: Path) -> None:
     made = folder_of(tmp_path, 0, 1, 3 << 20, 8 << 20, (16 << 20) + 1, 40 << 20)
     (root / "run").push(made)

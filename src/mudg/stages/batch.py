@@ -35,8 +35,8 @@ from mudg.stages.batches.plan import (
     read_list,
     shard,
 )
-from mudg.stages.batches.records import BatchFolder, slurm_tasks_left
-from mudg.stages.batches.work import DONE, STOPPED, Job, Report, is_open
+from mudg.stages.batches.records import BatchFolder, Ended, slurm_tasks_left
+from mudg.stages.batches.work import DONE, STOPPED, Job, is_open
 from mudg.stages.config import RunConfig
 from mudg.stages.config.batch import BatchConfig
 from mudg.stages.config.presets import PresetName, run_preset
@@ -116,7 +116,7 @@ def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]
     counts: Counter[str] = Counter()
     with log.task("batch", len(entries) * len(job.plan.stages)) as bar:
 
-        def tell(report: Report) -> None:
+        def tell(report: Ended) -> None:
             if report.state != STOPPED:
                 counts[report.state] += 1
             if report.state not in (DONE, STOPPED) and batch.engine == "ray":

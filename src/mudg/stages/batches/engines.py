@@ -21,10 +21,11 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.stages.batches.child import Stop
 from mudg.stages.batches.plan import REVISION, Entry
-from mudg.stages.batches.work import Job, Report, run_scene
+from mudg.stages.batches.records import Ended
+from mudg.stages.batches.work import LOST, Job, run_scene
 from mudg.stages.config.batch import BatchConfig
 
-Tell = Callable[[Report], None]
+Tell = Callable[[Ended], None]
 _LOST_NODES: Final = 20
 """How often Ray runs a scene again whose node or process is gone."""
 _AT_ONCE: Final = 2000
@@ -48,7 +49,7 @@ class LocalRun:
 
     def run(self, tell: Tell) -> None:
         """Do them all. Ctrl-C and SIGTERM stop every step with a checkpoint, a second one at once; KeyboardInterrupt goes on then."""
-        waiting, told = deque(self.entries), queue.SimpleQueue[Report | None]()
+        waiting, told = deque(self.entries), queue.SimpleQueue[Ended | None]()
 
         def work() -> None:
             try:
@@ -90,7 +91,7 @@ class LocalRun:
         concurrent.futures.wait(self._threads)
 
     def _fetch_ahead(self, entry: Entry, waiting: Sequence[Entry]) -> None:
-        """Begin to fetch the log of the next scene, once that of this one is here."""
+        """Wait for the log of this scene, if it is under way, and begin to fetch that of the next one."""
         thread = self._ahead.pop(entry.name, None)
         while thread is not None and thread.is_alive() and not self.stop.asked:
             thread.join(0.2)
@@ -136,7 +137,8 @@ def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tel
                     for report in ray.get(one):
                         tell(report)
                 except ray.exceptions.RayError as error:
-                    tell(Report(entry.name, "", "lost", words=str(error).splitlines()[0][:300]))
+                    words = str(error).splitlines()[0][:300]
+                    tell(Ended(scene=entry.name, stage=job.plan.stages[0].name, key="none", state=LOST, words=words))
     except KeyboardInterrupt:
         for one in running:
             ray.cancel(one, force=False)
@@ -144,7 +146,7 @@ def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tel
         raise
 
 
-def _ray_task(job: Job, entry: Entry) -> list[Report]:
+def _ray_task(job: Job, entry: Entry) -> list[Ended]:
     log.set_quiet(True)
     return run_scene(job, entry, Stop(job.grace_s))
 

@@ -23,8 +23,8 @@ from mudg.base.run_folder import refuse_overlaps
 from mudg.stages.batches.child import Stop
 from mudg.stages.batches.engines import LocalRun
 from mudg.stages.batches.plan import CITY, BatchPlan, Entry, listed_plan, parse_shard, shard
-from mudg.stages.batches.records import BatchFolder
-from mudg.stages.batches.work import DONE, Job, Report
+from mudg.stages.batches.records import BatchFolder, Ended
+from mudg.stages.batches.work import DONE, Job
 
 FAILED_BASE: Final = 10
 FAILED_MOST: Final = 99
@@ -82,10 +82,10 @@ def run_listed(asked: ListedRun, plan: BatchPlan | None = None) -> dict[str, Any
     folder = BatchFolder(Location.of(asked.out.absolute()))
     plan = plan or listed_plan(asked.verb, configuration.to_dict(asked.settings), asked.overwrite)
     before = {entry.name: _finished(asked.out / entry.name) for entry in entries}
-    told: dict[str, Report] = {}
+    told: dict[str, Ended] = {}
     with log.task(asked.verb, len(entries)) as bar, tempfile.TemporaryDirectory() as scratch:
 
-        def note(report: Report) -> None:
+        def note(report: Ended) -> None:
             told[report.scene] = report
             bar.advance()
 
@@ -111,7 +111,7 @@ def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: 
                 remedy="choose another --out")  # fmt: skip
 
 
-def _outcome(entry: Entry, report: Report, folder: Path, before: str) -> dict[str, Any]:
+def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str, Any]:
     """What became of a scene: ``done``, ``reused`` or ``failed``, with one line of what it holds or why it failed."""
     state, words, error = "failed", report.words, f"code {report.code}"
     if report.state == DONE:

@@ -60,7 +60,8 @@ class CorpusFacts(_Record):
 
 
 class Ended(_Record):
-    """The record of a step that is done or has failed. lost_s: processor seconds of attempts without a result."""
+    """How a step of a scene ended: done or failed, which is put on record; or stopped, or lost by its engine. lost_s: processor seconds
+    of attempts without a result."""
 
     scene: Name
     stage: Name
@@ -68,6 +69,7 @@ class Ended(_Record):
     source: str = ""
     place: str = ""
     digest: str = ""
+    state: str = ""
     host: str = ""
     code: Annotated[int, Field(ge=-1000, le=1000)] = 0
     words: str = ""

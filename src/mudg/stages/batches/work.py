@@ -36,7 +36,7 @@ from mudg.stages.batches.inputs import InputStore
 from mudg.stages.batches.plan import REVISION, BatchPlan, Entry, Unit, command_of
 from mudg.stages.batches.records import BatchFolder, CorpusFacts, Ended
 
-DONE, FAILED, STOPPED = "done", "failed", "stopped"
+DONE, FAILED, STOPPED, LOST = "done", "failed", "stopped", "lost"
 REASONS: Final[Mapping[int, str]] = {
     1: "a mistake in the program", 2: "usage", 3: "bad input", 4: "damaged result", 5: "memory or disk", 6: "numbers",
     130: "interrupted", KILLED: "killed, most likely for want of memory", ASKED_TO_STOP: "asked to stop",
@@ -85,21 +85,9 @@ class Job:
         return InputStore(self.scratch_root, self.token)
 
 
-@dataclass(frozen=True)
-class Report:
-    """How a step of a scene ended: ``done``, ``failed`` or ``stopped``."""
-
-    scene: str
-    stage: str
-    state: str
-    seconds: float = 0.0
-    words: str = ""
-    code: int = 0
-
-
-def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Report]:
-    """Do the steps of a scene that are not on record yet, until one fails or work is to stop."""
-    reports: list[Report] = []
+def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Ended]:
+    """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns how they ended."""
+    ended: list[Ended] = []
     with contextlib.ExitStack() as held:
         for unit in job.plan.units(entry):
             if not unit.stage.direct:
@@ -107,12 +95,11 @@ def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Report]:
                     continue
                 if job.folder.record("failed", unit.key).exists():
                     break
-            report = _Step(job, unit, stop, held).run() if not stop.asked else Report(entry.name, unit.stage.name, STOPPED)
-            reports.append(report)
-            if report.state != DONE:
-                log.warn(f"{unit.title} {report.state}: {report.words or 'the same command goes on'}")
+            ended.append(_Step(job, unit, stop, held).run())
+            if ended[-1].state != DONE:
+                log.warn(f"{unit.title} {ended[-1].state}: {ended[-1].words or 'the same command goes on'}")
                 break
-    return reports
+    return ended
 
 
 def is_open(plan: BatchPlan, entry: Entry, done: set[str], failed: set[str]) -> bool:
@@ -141,19 +128,15 @@ class _Step:
     def _published(self) -> Location:
         return self._job.folder.out / self._unit.place
 
-    def run(self) -> Report:
+    def run(self) -> Ended:
         """Try until it has ended well, has failed for good, or is to stop."""
         tries: Counter[int] = Counter()
-        while True:
+        while not self._stop.asked:
             ending, record = self._attempt(alone=tries[KILLED] > 0)
             if record is not None:
-                if self._direct is None:
-                    self._job.folder.end("done", record)
-                self._remove()
-                return self._report(DONE, ending)
+                return record
             if self._stop.asked and ending.code in (1, ResourceError.exit_code, 130, KILLED, ASKED_TO_STOP):
-                self._leave()
-                return self._report(STOPPED, replace(ending, words=""))
+                break
             self._lost_s += ending.processor_s
             waits = WAITS_S.get(ending.code, (5.0,) if ending.code > 128 else ())
             again = self._direct is None or ending.code == KILLED
@@ -167,11 +150,13 @@ class _Step:
             log.warn(f"{self._unit.title} is tried again: {ending.words}")
             self._stop.sleep(waits[tries[ending.code]])
             tries[ending.code] += 1
+        self._leave()
+        return self._ended(STOPPED, Ending(ASKED_TO_STOP))
 
     def _attempt(self, alone: bool) -> tuple[Ending, Ended | None]:
         ending, adopted = self._unpublished or Ending(0), None
         try:
-            adopted = None if self._unpublished else self._adopted()
+            adopted = self._adopted()
             if adopted is None and not self._unpublished:
                 self._prepare()
                 if alone:
@@ -183,6 +168,9 @@ class _Step:
             record = self._record(adopted or self._result, ending)
             if adopted is None:
                 self._publish()
+            self._remove()
+            if self._direct is None:
+                self._job.folder.end("done", record)
             return ending, record
         except (MudgError, OSError, MemoryError) as error:
             told = failures.in_words(error)
@@ -242,8 +230,9 @@ class _Step:
                 return None
             self._published.fetch(self._result)
         except MudgError as error:
-            log.warn(f"{self._published} cannot be used and is made again: {error.what}")
-            self._remove()
+            log.warn(f"{self._published} cannot be used: {error.what}")
+            if self._unpublished is None:
+                self._remove()
             return None
         return self._result
 
@@ -351,27 +340,26 @@ class _Step:
 
     # ends --------------------------------------------------------------------------------------------------------------
 
-    def _report(self, state: str, ending: Ending) -> Report:
-        return Report(self._unit.entry.name, self._unit.stage.name, state, ending.seconds, ending.words, ending.code)
-
-    def _ended(self, ending: Ending, **more: Any) -> Ended:
+    def _ended(self, state: str, ending: Ending, **more: Any) -> Ended:
         unit = self._unit
-        return Ended(scene=unit.entry.name, stage=unit.stage.name, key=unit.key, source=unit.entry.source, place=unit.place,
+        return Ended(scene=unit.entry.name, stage=unit.stage.name, key=unit.key, source=unit.entry.source, place=unit.place, state=state,
             host=socket.gethostname(), code=ending.code, words=ending.words[:2000], ended=round(time.time(), 3),
             seconds=round(ending.seconds, 3), processor_s=round(ending.processor_s, 3), lost_s=round(self._lost_s, 3), **more)  # fmt: skip
 
     def _record(self, result: Path, ending: Ending) -> Ended:
-        facts = facts_of(result)
-        return self._ended(ending, digest=digest_of(result), written_bytes=folder_bytes(result), peak_bytes=peak_of(result), facts=facts)
+        if self._direct is not None:
+            return self._ended(DONE, ending)
+        return self._ended(DONE, ending, digest=digest_of(result), written_bytes=folder_bytes(result), peak_bytes=peak_of(result),
+            facts=facts_of(result))  # fmt: skip
 
-    def _fail(self, ending: Ending) -> Report:
-        if self._direct is None:
-            with contextlib.suppress(MudgError):
-                if ending.text:
-                    self._job.folder.log(self._unit.key).save(ending.text.encode())
-                self._job.folder.end("failed", self._ended(replace(ending, processor_s=0.0)))
+    def _fail(self, ending: Ending) -> Ended:
+        record = self._ended(FAILED, replace(ending, processor_s=0.0))
         self._remove()
-        return self._report(FAILED, ending)
+        if self._direct is None:
+            if ending.text:
+                self._job.folder.log(self._unit.key).save(ending.text.encode())
+            self._job.folder.end("failed", record)
+        return record
 
 
 # facts about results ----------------------------------------------------------------------------------------------------
