@@ -104,25 +104,9 @@ def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     content = broken.read_bytes()
     broken.write_bytes(content[:-5])
     (tmp_path / "list.txt").write_text(f"{drives[0]} name=first frames=0:3\n{drives[1]} name=second\n")
-<<<<<<< HEAD
-    words = [
-        "ingest",
-        "kitti",
-        "--list",
-        str(tmp_path / "list.txt"),
-        "--out",
-        str(tmp_path / "scenes"),
-        "--jobs",
-        "2",
-        "--no-contact-sheet",
-        "--quiet",
-    ]
-    assert app.main(words) == 11
-=======
     words = ["ingest", "kitti", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "scenes"), "--jobs", "2",
              "--no-contact-sheet", "--quiet"]  # fmt: skip
-    assert cli.main(words) == 11
->>>>>>> fleet
+    assert app.main(words) == 11
     said = capsys.readouterr().out
     assert "1 of 2 scenes are there, 1 failed" in said and "cut off" in said
     assert len(read_scene(tmp_path / "scenes" / "first").frames) == 3

@@ -567,23 +567,12 @@ def test_templates_start_a_batch() -> None:
 
     spec = yaml.safe_load((EXAMPLES / "batch_kubernetes.yaml").read_text())["spec"]
     pod, (container,) = spec["template"]["spec"], spec["template"]["spec"]["containers"]
-<<<<<<< HEAD
-    words = [*container["command"], *container["args"]]
-    parsed, _ = app.parse(words[1:])
-    assert parsed.shard == f"env/{spec['completions']}"
-=======
-    parsed = cli.parse([*container["command"], *container["args"]][1:])
+    parsed, _ = app.parse([*container["command"], *container["args"]][1:])
     assert spec["completionMode"] == "Indexed" and parsed.shard == f"env/{spec['completions']}"
->>>>>>> fleet
     assert pod["terminationGracePeriodSeconds"] > parsed.settings.grace_s
     rules = [rule["onExitCodes"] for rule in spec["podFailurePolicy"]["rules"] if "onExitCodes" in rule]
     assert {rule["containerName"] for rule in rules} == {container["name"]}
     assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
     task = yaml.safe_load((EXAMPLES / "batch_skypilot.yaml").read_text())
     line = next(line for line in task["run"].splitlines() if line.startswith("mudg"))
-<<<<<<< HEAD
     assert app.parse(line.split()[1:])[0].shard == "env"
-    assert differs({"a": 1, "c": "x"}, {"a": str, "b": int}) == [".c", ".b is missing", ".a: 1"]
-=======
-    assert cli.parse(line.split()[1:]).shard == "env"
->>>>>>> fleet
