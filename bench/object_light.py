@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mudg.base.palette import ID
-from mudg.bench.edit import EVERY_FRAMES, EditCase, case_of
+from mudg.benchmarks.edit import EVERY_FRAMES, EditCase, case_of
 from mudg.data.city import CityWorld
 from mudg.models.scene.edited import LIGHT_EXPONENT, linear_of
 from mudg.stages.config import BenchConfig

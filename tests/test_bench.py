@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mudg.base.errors import MudgError, UsageError
-from mudg.bench import run as bench
+from mudg.benchmarks import run as bench
 from mudg.core import flicker
 from mudg.data.clips import from_city
 from mudg.models.mdm import files

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mudg.bench import edit
-from mudg.bench import run as bench
+from mudg.benchmarks import edit
+from mudg.benchmarks import run as bench
 from mudg.models.scene.edited import display_of
 from mudg.stages.config import BenchConfig
 

@@ -14,9 +14,9 @@ from toy_world import fused_cloud, write_scene
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
-from mudg.bench import edit_runs
-from mudg.bench import run as bench
-from mudg.bench.edit_runs_measure import RunCase, measured
+from mudg.benchmarks import edit_runs
+from mudg.benchmarks import run as bench
+from mudg.benchmarks.edit_runs_measure import RunCase, measured
 from mudg.core import edit_scores
 from mudg.core.table import Table
 from mudg.data.cloudfile import write_fused

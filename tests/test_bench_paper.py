@@ -15,11 +15,11 @@ from test_bench import SMALL
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.bench import page, paper, papers, places, views
-from mudg.bench import run as bench
-from mudg.bench.chain import write_fill
-from mudg.bench.papers import PAPERS, RECORDED, SCENE_LISTS, TABLES
-from mudg.bench.rows import LONGER, paper_rows
+from mudg.benchmarks import page, paper, papers, places, views
+from mudg.benchmarks import run as bench
+from mudg.benchmarks.chain import write_fill
+from mudg.benchmarks.papers import PAPERS, RECORDED, SCENE_LISTS, TABLES
+from mudg.benchmarks.rows import LONGER, paper_rows
 from mudg.core import trajectory
 from mudg.core.feature_distances import frechet_distance, kernel_distance
 from mudg.data.city import logs as city_logs

@@ -14,10 +14,10 @@ from mudg.app import parse
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import UsageError
-from mudg.bench import run as bench
-from mudg.bench import shift
-from mudg.bench.papers import RECORDED, TABLES
-from mudg.bench.rows import LONGER, method_fit, shift_rows
+from mudg.benchmarks import run as bench
+from mudg.benchmarks import shift
+from mudg.benchmarks.papers import RECORDED, TABLES
+from mudg.benchmarks.rows import LONGER, method_fit, shift_rows
 from mudg.data.city.config import CityConfig
 from mudg.data.city.logs import LogRules
 from mudg.data.clips.ablated import ConditionSources, conditions_of

@@ -15,10 +15,10 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
-from mudg.bench import columns, places, real, truth
-from mudg.bench.chain import Chain, write_fill
-from mudg.bench.places import PROTOCOLS, SPLITS
-from mudg.bench.rows import real_rows
+from mudg.benchmarks import columns, places, real, truth
+from mudg.benchmarks.chain import Chain, write_fill
+from mudg.benchmarks.places import PROTOCOLS, SPLITS
+from mudg.benchmarks.rows import real_rows
 from mudg.core import color_match, points_seen
 from mudg.core.fusion import STATIC
 from mudg.data.city import CityWorld

@@ -11,10 +11,10 @@ from test_bench import SMALL
 
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
-from mudg.bench import run as bench
-from mudg.bench import shift
-from mudg.bench.chain import write_exact
-from mudg.bench.rows import LONGER, shift_rows
+from mudg.benchmarks import run as bench
+from mudg.benchmarks import shift
+from mudg.benchmarks.chain import write_exact
+from mudg.benchmarks.rows import LONGER, shift_rows
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import LogRules

@@ -23,7 +23,7 @@ from mudg.base.config import result_settings
 from mudg.base.types import FusedCloud, PointCloud
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import read_observations
-from mudg.report import gallery, run_report
+from mudg.pages import gallery, run_report
 from mudg.stages import convert, edit, run, score
 from mudg.stages.config import RunConfig
 from mudg.stages.editing.runs import RunParts

@@ -12,9 +12,9 @@ from toy_world import camera, fused_cloud, view_at
 from mudg.base.errors import UsageError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import FusedCloud, Photo
-from mudg.bench import chain
-from mudg.bench.chain import Chain, repair_settings
-from mudg.bench.rows import Row
+from mudg.benchmarks import chain
+from mudg.benchmarks.chain import Chain, repair_settings
+from mudg.benchmarks.rows import Row
 from mudg.data.clips import condition as clips
 from mudg.data.clips.ablated import ConditionSources, conditions_of
 from mudg.data.clips.condition import ConditionRules

@@ -18,7 +18,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
-from mudg.bench.edit import city_keys
+from mudg.benchmarks.edit import city_keys
 from mudg.core import boxes
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, Motion

@@ -18,7 +18,7 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Scene
-from mudg.bench import run as bench
+from mudg.benchmarks import run as bench
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.edits import parse_edits
 from mudg.data.observations import read_observations

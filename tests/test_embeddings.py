@@ -17,7 +17,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.core import feature_distances
 from mudg.models import clip_image, dinov2
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring.embeddings import subject_consistency

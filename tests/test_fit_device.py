@@ -24,8 +24,8 @@ from mudg.base import store
 from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.bench import loop, rows
-from mudg.bench import poses as bench_poses
+from mudg.benchmarks import loop, rows
+from mudg.benchmarks import poses as bench_poses
 from mudg.core import native_ops
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig

@@ -20,7 +20,7 @@ from mudg.base.palette import ID
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, View
 from mudg.base.weather_settings import Conditions
-from mudg.bench import run as bench
+from mudg.benchmarks import run as bench
 from mudg.core.edit import Motion
 from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings

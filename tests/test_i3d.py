@@ -14,7 +14,7 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.data.scene import read_scene
 from mudg.models import i3d
-from mudg.report import page, score_tables
+from mudg.pages import page, score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring import distributions, videos

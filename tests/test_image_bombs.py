@@ -21,7 +21,7 @@ from mudg.data.importers.waymo import sensors as waymo
 from mudg.data.observations import read_image_file
 from mudg.data.scene import labels
 from mudg.data.scene.read import check_image, decode_image
-from mudg.report import gallery
+from mudg.pages import gallery
 from mudg.stages.scoring.detections import read_mask
 
 CAMERA = Camera("front", 60_000, 60_000, 100.0, 100.0, 30_000.0, 30_000.0)

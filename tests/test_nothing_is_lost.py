@@ -23,8 +23,8 @@ from toy_scene import ToyStreet
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import UsageError
-from mudg.bench import chain, page
-from mudg.bench import run as bench
+from mudg.benchmarks import chain, page
+from mudg.benchmarks import run as bench
 from mudg.core import trajectory
 from mudg.data.city import CityConfig
 from mudg.data.scene import read_scene, write_zip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mudg.data.scene.check import Finding, folded
-from mudg.report import score_tables
+from mudg.pages import score_tables
 
 
 def test_warnings_of_a_kind_are_one_line_with_three_examples() -> None:

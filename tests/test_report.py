@@ -25,9 +25,9 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.data.edits import read_edits
-from mudg.report import html as report_html
-from mudg.report import page as report_page
-from mudg.report import run_report
+from mudg.pages import html as report_html
+from mudg.pages import page as report_page
+from mudg.pages import run_report
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 

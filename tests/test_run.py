@@ -20,7 +20,7 @@ from mudg.base import (
     usage,
 )
 from mudg.base.errors import InputError, IntegrityError, NumericsError, ResourceError, UsageError
-from mudg.report import run_report
+from mudg.pages import run_report
 from mudg.stages import adapt, annotate, fit, fuse, ingest, render, run, score, synthesize
 from mudg.stages.config import RunConfig, run_preset, with_seed
 

@@ -19,7 +19,7 @@ import mudg
 from mudg import FittedScene, app, steps
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.bench import run as bench
+from mudg.benchmarks import run as bench
 from mudg.data.importers import FORMATS
 from mudg.stages import adapt, annotate, fit, fuse, render, score, synthesize
 

@@ -16,7 +16,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.pictures import resize_nearest
 from mudg.models import featnets
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 

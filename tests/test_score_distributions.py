@@ -17,7 +17,7 @@ from mudg.base.types import Observation
 from mudg.core import feature_distances
 from mudg.data.scene import read_scene
 from mudg.models import inception
-from mudg.report import page, score_tables
+from mudg.pages import page, score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring import distributions

@@ -20,7 +20,7 @@ from mudg.core.metrics import Pair
 from mudg.data.city import CityConfig, CityWorld
 from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.models.mdm import files
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 

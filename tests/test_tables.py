@@ -5,8 +5,8 @@ import io
 
 import pytest
 
-from mudg.report import html
-from mudg.report.tables import (
+from mudg.pages import html
+from mudg.pages.tables import (
     PUBLISHED,
     TextCell,
     TextLine,

@@ -27,7 +27,7 @@ from mudg.data.observations import read_observations
 from mudg.data.scene import read_scene
 from mudg.models.scene.edited import motion_of
 from mudg.models.scene.model import SceneModel
-from mudg.report.viewer.facts import UNKNOWN, PageFacts, with_ground
+from mudg.pages.viewer.facts import UNKNOWN, PageFacts, with_ground
 from mudg.stages import edit, render
 from mudg.stages.config import EditConfig, RenderConfig
 from mudg.stages.config.view import PageConfig

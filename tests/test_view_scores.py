@@ -21,7 +21,7 @@ from mudg.core.view_facts import ViewFacts
 from mudg.data.city import CityConfig, CityWorld, write_city
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_scene
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages import score, score_truth
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring import detections

@@ -28,9 +28,9 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
 from mudg.models.scene.model import SceneModel
-from mudg.report.viewer import page as viewer_page
-from mudg.report.viewer.chunks import chunk_rows, coverage, level_of, morton_codes, opacity_of
-from mudg.report.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
+from mudg.pages.viewer import page as viewer_page
+from mudg.pages.viewer.chunks import chunk_rows, coverage, level_of, morton_codes, opacity_of
+from mudg.pages.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
 from mudg.stages.config.view import PageConfig
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.viewing import view

@@ -18,7 +18,7 @@ MAX_FILES_IN_STAGES = 16
 
 # Floor of each part of the package; an import may only reach a lower number, or its own part.
 FLOORS = {
-    "base": 1, "core": 2, "native": 2, "data": 3, "models": 3, "methods": 3.5, "report": 3.8, "stages": 4, "bench": 4.5,
+    "base": 1, "core": 2, "native": 2, "data": 3, "models": 3, "methods": 3.5, "pages": 3.8, "stages": 4, "benchmarks": 4.5,
     "fitted": 4.8, "steps": 4.9,
     "app": 5, "__main__": 5, "__init__": 5,
 }  # fmt: skip
@@ -234,7 +234,7 @@ def test_only_the_store_opens_files_for_writing(package_dir: Path) -> None:
     refuse(problems)
 
 
-READS_OF_OTHERS = {"base/memory.py", "base/processes.py", "native/__init__.py", "steps/step.py", "report/viewer/page.py"}
+READS_OF_OTHERS = {"base/memory.py", "base/processes.py", "native/__init__.py", "steps/step.py", "pages/viewer/page.py"}
 """Files that read what the system, or this package itself, provides."""
 
 
@@ -262,12 +262,12 @@ def test_only_the_store_opens_files_for_reading(package_dir: Path) -> None:
 
 
 def test_outputs_are_kept_apart_from_inputs(package_dir: Path) -> None:
-    """A verb's folder is opened after its inputs were compared with it; ``bench/poses.py`` opens folders of its own result."""
+    """A verb's folder is opened after its inputs were compared with it; ``benchmarks/poses.py`` opens folders of its own result."""
     problems = []
     for name, tree in parsed(package_dir):
         opened = [call.lineno for call, function in calls(tree) if function.endswith("RunDir.open")]
         compared = [call.lineno for call, function in calls(tree) if function.endswith(("refuse_overlap", "_refuse_overlap"))]
-        if len(compared) < len(opened) and name != "bench/poses.py":
+        if len(compared) < len(opened) and name != "benchmarks/poses.py":
             problems.append(f"{name}:{opened[0]}: RunDir.open without refuse_overlap")
     refuse(problems)
 

@@ -30,7 +30,7 @@ from mudg.models.folders import CPU
 from mudg.models.labels.ground import driven_path
 from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.models.labels.labellers import labeller
-from mudg.report.annotate_page import write_page
+from mudg.pages.annotate_page import write_page
 from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.batches.plan import read_list
 from mudg.stages.config import AnnotateConfig

@@ -34,7 +34,7 @@ from mudg.core.fusion import (
 from mudg.data.cloudfile import write_fused
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.data.scene.check import check_distance
-from mudg.report.top_view import TopView, draw_top_view
+from mudg.pages.top_view import TopView, draw_top_view
 from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.batches.plan import read_list
 from mudg.stages.config import FuseConfig

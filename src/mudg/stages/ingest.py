@@ -19,7 +19,7 @@ from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
 from mudg.data.scene import SCENE_FILES, SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
-from mudg.report import contact_sheet
+from mudg.pages import contact_sheet
 from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.batches.plan import OF_A_LINE, read_list
 from mudg.stages.config import IngestConfig

@@ -83,7 +83,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
 def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: bool) -> dict[str, Any]:
     """The chain, alone in its folder."""
-    from mudg.report import run_report
+    from mudg.pages import run_report
 
     ledger = _Ledger.open(out, config, str(source), overwrite)
     config = with_device(config)
@@ -116,7 +116,7 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
 def _write_viewer(out: Path) -> Path:
     """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside it."""
     from mudg.base.result_file import description_path
-    from mudg.report.run_report import VIEWER
+    from mudg.pages.run_report import VIEWER
     from mudg.stages.config import PageConfig
     from mudg.stages.viewing import view
 

@@ -38,7 +38,7 @@ from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
 from mudg.data.scene import read_scene
 from mudg.models.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.fitting.perception import lpips_network
 from mudg.stages.score_truth import ViewTruth, stored_truth, truth_of

@@ -64,7 +64,7 @@ class Bench(Output):
         return not named or part in named
 
     def run(self) -> Path:
-        from mudg.bench import run as bench
+        from mudg.benchmarks import run as bench
 
         return bench.run(self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite)
 

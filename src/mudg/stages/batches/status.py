@@ -219,7 +219,7 @@ def _lead(state: BatchStatus) -> str:
 
 def page_of(state: BatchStatus) -> str:
     """The status as a page, with figures of the logs."""
-    from mudg.report import html
+    from mudg.pages import html
 
     corpus = state.corpus()
     return html.render(

@@ -1,6 +1,6 @@
 """The fit of ``difix``: Difix3D (Wu et al. 2025), a scene that learns from its own renders beside the path, repaired.
 
-Published, and here: renders at poses that move towards the wanted ones step by step (``bench/chain.py``) are repaired in one pass of a
+Published, and here: renders at poses that move towards the wanted ones step by step (``benchmarks/chain.py``) are repaired in one pass of a
 network that sees the render and a recorded image; of the steps that may use them, three in ten learn from one, with weight 0.3.
 Different here (``docs/baselines.md``): the network is our diffusion model; objects have boxes, as in ``street_gaussians``. Left out: the
 repair of what the finished scene shows.

@@ -18,7 +18,7 @@ from torch import Tensor
 from mudg.base.errors import UsageError
 from mudg.models.published import files as published_files
 from mudg.models.published.model import PublishedMDM, WorkSplit
-from mudg.report import html
+from mudg.pages import html
 from mudg.stages.config import LearnConfig
 from mudg.stages.learning import score as learn_score
 

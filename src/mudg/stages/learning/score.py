@@ -24,7 +24,7 @@ from mudg.data.clips.condition import filled_depth
 from mudg.models.diffusion import GeneratedClip, SampleRequest, generated
 from mudg.models.mdm.model import MDM
 from mudg.models.published.model import PublishedMDM
-from mudg.report import html
+from mudg.pages import html
 from mudg.stages.config import LearnConfig
 
 SKY = palette.ID["sky"]

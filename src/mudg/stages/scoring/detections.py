@@ -33,7 +33,7 @@ from mudg.core.box_scores import (
 from mudg.core.fusion import points_in_box
 from mudg.data.city import CityWorld
 from mudg.data.scene import read_points
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.score_truth import SAME_SWEEP_S
 

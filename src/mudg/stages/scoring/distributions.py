@@ -30,7 +30,7 @@ from mudg.core.pictures import resize_rgb, to_bytes
 from mudg.data.scene import read_image
 from mudg.data.weights import read_checkpoint
 from mudg.models import inception
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring.converted import source_sha256
 

@@ -20,7 +20,7 @@ from mudg.base.types import Scene, View
 from mudg.core.feature_distances import cmmd_distance, frechet_distance
 from mudg.data.weights import read_checkpoint
 from mudg.models import clip_image, dinov2
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.score_truth import SAME_TIME_S
 from mudg.stages.scoring.distributions import (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.core.feature_distances import frechet_distance, polynomial_distance
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages.scoring.distributions import FEWEST
 
 RECORDED: Final = "recorded"

@@ -21,7 +21,7 @@ from mudg.base.types import Scene
 from mudg.core.feature_distances import frechet_distance
 from mudg.data.weights import read_checkpoint
 from mudg.models import i3d
-from mudg.report import score_tables
+from mudg.pages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring.distributions import (
     FEATURES_FOLDER,

@@ -21,8 +21,8 @@ from mudg.data.edits import EditScript, parse_edits, read_edits
 from mudg.models.scene.edited import motion_of
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
-from mudg.report.viewer.facts import begin_of
-from mudg.report.viewer.packed import key_rows
+from mudg.pages.viewer.facts import begin_of
+from mudg.pages.viewer.packed import key_rows
 from mudg.stages.editing.apply import left_behind, street_left
 from mudg.stages.editing.carried import EditedDrive, carry_out
 from mudg.stages.editing.plan import EditPlan

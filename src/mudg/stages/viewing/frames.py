@@ -22,7 +22,7 @@ from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.data.clips.weathered import InWeather
 from mudg.data.exporters.video import mp4_bytes
 from mudg.models.scene.model import SceneModel
-from mudg.report.page import FAR_M, NEAR_M
+from mudg.pages.page import FAR_M, NEAR_M
 from mudg.stages.editing.carried import FACT
 from mudg.stages.editing.weathered import Drawer, conditions_of, in_weather, weather_of
 from mudg.stages.fitting.rendering import raster_of, render_view

@@ -10,7 +10,7 @@ from typing import Any
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.result_file import ResultFile
-from mudg.report.gallery import GalleryEntry, Unread, page, read_shown
+from mudg.pages.gallery import GalleryEntry, Unread, page, read_shown
 
 
 def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str, Any]:

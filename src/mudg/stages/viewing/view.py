@@ -1,5 +1,5 @@
 """``mudg page``: a fitted scene as a page that anyone can open. ``mudg view``: the same page from a server on this machine, with exact
-frames where the camera rests. The page is ``assets/viewer``; what it is made of, ``report/viewer``.
+frames where the camera rests. The page is ``assets/viewer``; what it is made of, ``pages/viewer``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from mudg.core.raster.place import drawing_device
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import SceneModel
-from mudg.report.viewer.chunks import CHUNK
-from mudg.report.viewer.facts import begin_of, log_facts, with_ground, with_particles
-from mudg.report.viewer.packed import Packed, pack_scene
-from mudg.report.viewer.page import ONE_FILE_BYTES, PageFile, ViewerPage, most_within
+from mudg.pages.viewer.chunks import CHUNK
+from mudg.pages.viewer.facts import begin_of, log_facts, with_ground, with_particles
+from mudg.pages.viewer.packed import Packed, pack_scene
+from mudg.pages.viewer.page import ONE_FILE_BYTES, PageFile, ViewerPage, most_within
 from mudg.stages.config.view import PageConfig, ViewConfig
 from mudg.stages.editing.apply import ground_of
 from mudg.stages.editing.runs import RunParts, find_run

@@ -1,0 +1,532 @@
+"""``mudg bench paper``: a table of a paper, filled with our numbers, on generated cities or recorded logs.
+
+A table (``papers.yaml``) says which frames, places and columns. Every log is prepared once; every method is fitted, rendered and scored on
+its own, by the ordinary verbs, so that whatever is finished is reused and an interrupted table goes on. In every table stand the truth
+(what it scores itself) and the fused points with holes filled.
+
+A cell is a number or the reason why there is none. A mean over logs is one over all of them: a method that lacks a number on one log has
+none in that cell, for means over other logs could not be compared. FID, KID and FVD compare the views of all logs at a place, as one set
+as in papers, with all recorded frames of their cameras; a mean of the distances of small sets is mostly bias.
+
+    OUT/<log>/...   see ``benchmarks/views.py``; views that fits learn from lie in OUT/<log>/virtual
+    OUT/bench.json   every number   OUT/bench.md bench.csv bench.tex   the table   OUT/page.html   table and pictures
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import config as configuration
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.run_folder import refuse_overlap
+from mudg.benchmarks import page as pages
+from mudg.benchmarks.loop import compare, refuse_foreign, seconds_of
+from mudg.benchmarks.papers import PAPERS, TABLES, PaperColumn, PaperTable
+from mudg.benchmarks.places import ListedCity, first_camera, logs_of, missing_scenes
+from mudg.benchmarks.rows import FILL, REPAIRED, Row, chain_settings, generator_of, paper_rows, refuse_unfit
+from mudg.benchmarks.shift import standard_error, virtual_fits_of
+from mudg.benchmarks.views import TRUTH, Views, of_log, score_settings
+from mudg.core.metrics import METRICS
+from mudg.methods import METHODS
+from mudg.models.mdm import files as mdm_files
+from mudg.pages.score_tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
+from mudg.pages.tables import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
+from mudg.pages.tables import markdown as rendered
+from mudg.stages.config import BenchConfig, PresetName, ScoreConfig
+from mudg.stages.scoring.distributions import FEATURES_FOLDER, FEWEST, distances
+from mudg.stages.scoring.videos import compared
+
+PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
+ANCHORS: Final = {TRUTH: "the truth itself", FILL: "fused points, holes filled"}
+"""Rows that every table has, with their titles; the first is no method and enters no ranking."""
+BY_DEFINITION: Final = frozenset({"psnr", "ssim", "psnr_movers", "lpips", "perceptual", "abs_rel", "miou"})
+"""Columns that compare view with view: the truth against itself says nothing there."""
+SELF: Final = "perfect by definition"
+NOT_SCORED: Final = "no score of this version"
+OTHER_N: Final = "other n"
+POOLED: Final = ("distributions", "videos")
+"""Entries of metrics.json whose sets of features, one per trajectory, are put together over all logs."""
+ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
+NONE: Final = "-"
+"""What stands in a column without any number; a note gives the reason once."""
+Files = dict[str, dict[str, list[str]]]
+"""Entry of ``POOLED`` -> files of the features "made" and of their "reference", relative to the folder of the benchmark."""
+Values = dict[str, dict[str, Any]]
+"""Column -> ``{"value": number or reason, "n", "n_reference"}``."""
+
+
+@dataclass(frozen=True)
+class PaperLog(Views):
+    """One log under a table."""
+
+    @property
+    def title(self) -> str:
+        """For the progress bar."""
+        return self.log.name
+
+    def measure(self) -> dict[str, Any]:
+        """Facts of the log, per row and place the values with their numbers of views, and seconds."""
+        views, truth, out = self.of_rows(), self.truth, self.out.parent
+        shown = views if truth is None else {TRUTH: truth, **views}
+        scored = {name: self.scores(name, folders) for name, folders in views.items()}
+        if truth is not None:
+            scored[TRUTH] = self.scores(TRUTH, (truth,))
+        names = {place.name: self.trajectories(place.endings(self.log.side)) for place in self.table.places}
+        keys = {column.key: column for column in (*self.table.columns, *further_columns(truth is not None))}
+        columns = tuple(keys.values())
+        values = {row: {p: at_place(tuple(of.values()), at, columns) for p, at in names.items()} for row, of in scored.items()}
+        features = {row: {p: files_at(of, at, out) for p, at in names.items()} for row, of in scored.items()}
+        fill = tuple(scored[FILL].values())
+        for row in self.rows:
+            if row.left_out:
+                why = "the model uses no renders" if row.name == REPAIRED else "no model: --freevs-model"
+                values[row.name] = dict.fromkeys(names, {key: {"value": why} for key in keys})
+        if truth is None:  # it is not known off the path: the scorer's floors, and frames of the reference against others of it
+            values[TRUTH] = {p: floors_at(fill, at, columns) for p, at in names.items()}
+            features[TRUTH] = {
+                p: {entry: {"made": [], "reference": of["reference"]} for entry, of in files.items()} for p, files in features[FILL].items()
+            }
+        films, scene = self.film(shown), self.loaded
+        sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in scene.cameras.values())
+        return {
+            "log": self.log.name, "dataset": scene.source.dataset, "cameras": list(scene.cameras),
+            "frames": len(scene.frames_of(first_camera(scene, ()))), "size": ", ".join(sizes),
+            "held_out": len(scene.frames_in("test")), "tracks": len(scene.tracks), "note": self.log.note, "exact": truth is not None,
+            "values": values, "features": features, "made": _made_of(fill), "films": films, "columns": list(shown),
+            "seconds": seconds_of(self.out),
+        }  # fmt: skip
+
+
+def run(
+    config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False
+) -> Path:
+    """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown, CSV and LaTeX, and ``page.html``.
+
+    Args:
+        config: see ``BenchConfig``; fields marked paper, and model, precision, iterations and seed. preset: what it started from.
+        sources: ``city:reported`` (or another list of cities), or folders of recorded logs.
+        out: what lies there of the same settings is reused; logs and methods may be added later.
+        overwrite: replace what other settings left there.
+
+    Raises:
+        UsageError: an unknown method or list, a setting that no row of the table uses, or ``out`` holds something else. InputError:
+            methods have different numbers of views. Whatever a verb raises.
+    """
+    table, out = TABLES[config.table], Path(out)
+    rows = paper_rows(config, table, preset)
+    logs = logs_of(config, sources, table)
+    read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
+    weights = _weights_of(config.score)
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights})
+    digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
+    digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
+    refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
+    generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize" and not row.left_out]
+    refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
+    measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
+    fill = Row(FILL, ANCHORS[FILL])
+    jobs = [
+        PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite) for log in logs
+    ]  # fmt: skip
+    settings = {
+        "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "", "missing_scenes": missing_scenes(table, logs),
+        "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model), "renders": renders,
+        "videos": config.videos, "score": configuration.result_settings(measured), "digests": digests, **chain_settings(config, preset),
+    }  # fmt: skip
+    values = [{"name": row.name, "title": row.title, "method": row.method, "changes": dict(row.changes)} for row in rows]
+    texts = {"bench.md": markdown, "bench.csv": as_csv, "bench.tex": as_latex, "page.html": page}
+    return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), texts)
+
+
+def _weights_of(config: ScoreConfig) -> dict[str, str]:
+    """Files and folders that a score reads: setting -> path."""
+    result = {name: value for name, value in configuration.to_dict(config).items() if isinstance(value, str) and value}
+    return {name: value for name, value in result.items() if name.endswith("weights") or Path(value).exists()}
+
+
+def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
+    """The further columns of logs with or without exact truth, as far as `mudg score` has them."""
+    return tuple(PAPERS.columns[key] for key in PAPERS.further["exact" if exact else "measured"] if key in METRICS)
+
+
+# ---- values of one log at a place ----
+
+
+def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
+    """Values of one method on one log at a place.
+
+    Args:
+        documents: contents of ``metrics.json`` that hold its trajectories, one method each.
+        names: trajectories of the place; the mean over them, and the sum of their numbers of views.
+    """
+    results = {row["trajectory"]: row for document in documents for row in document["results"]}
+    rows = [results.get(name) for name in names]
+    known = {metric["name"] for document in documents for metric in document["metrics"]}
+    return {column.key: _value(column, rows) if column.key in known else {"value": NOT_SCORED} for column in columns}
+
+
+def _value(column: PaperColumn, rows: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
+    values = [None if row is None else row["values"].get(column.key, NOT_COMPUTED) for row in rows]
+    reasons = [value for value in values if isinstance(value, str)]
+    if reasons or None in values:
+        return {"value": _reason(column, reasons[0] if reasons else "not produced")}
+    counts = [row.get(column.counts, {}) if column.counts else row for row in rows if row is not None]
+    result = {"value": fmean(values), "n": sum(int(of["n" if column.counts else "views"]) for of in counts)}
+    return result | ({"n_reference": sum(int(of["n_reference"]) for of in counts)} if column.counts else {})
+
+
+def _reason(column: PaperColumn, reason: str) -> str:
+    if reason == NOT_COMPUTED and column.needs:
+        what = "no weights" if column.needs.endswith("_weights") else "not given"
+        return f"{what}: --score.{column.needs.replace('_', '-')}"
+    return "no truth off the path on a recorded log" if reason == NO_TRUTH else reason
+
+
+def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
+    """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views alone."""
+    result: Values = {}
+    for column in columns:
+        entry = SET_METRICS.get(column.key, "")
+        floors = {f["trajectory"]: f for document in documents for f in document.get(entry, {}).get("floors", [])}
+        known = [floors[name] for name in names if name in floors]
+        if known and len(known) == len(names):
+            value = fmean(f[column.key] for f in known)
+            result[column.key] = {"value": value, **{key: sum(f[key] for f in known) for key in ("n", "n_reference")}}
+        else:
+            missing = SELF if column.key in BY_DEFINITION else NOT_COMPUTED if entry else NO_TRUTH
+            result[column.key] = {"value": _reason(column, missing)}
+    return result
+
+
+def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How distances of sets were made: networks, digests of their weights, resize rules, epsilon, clips."""
+    result: dict[str, Any] = {"depth_rule": documents[0]["rules"][3] if len(documents[0]["rules"]) > 3 else ""}
+    for document in documents:
+        for entry in dict.fromkeys(SET_METRICS.values()):
+            if document.get(entry):
+                result[entry] = {name: value for name, value in document[entry].items() if name not in ("floors", "sets")}
+    return result
+
+
+# ---- sets of all logs ----
+
+
+def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], out: Path) -> Files:
+    """Files of features of one method on one log at a place; an entry that lacks a trajectory is left out.
+
+    Args:
+        documents: folder of scores -> its metrics.json, one method each. names: trajectories of the place. out: of the benchmark.
+    """
+    result: Files = {}
+    for entry in POOLED:
+        sets = {
+            record["trajectory"]: [(folder / FEATURES_FOLDER / record[part]).relative_to(out).as_posix() for part in ("made", "reference")]
+            for folder, document in documents.items() for record in document.get(entry, {}).get("sets", [])
+        }  # fmt: skip
+        known = [sets[name] for name in names if name in sets]
+        if known and len(known) == len(names):
+            made, reference = zip(*known, strict=True)
+            result[entry] = {"made": list(made), "reference": list(dict.fromkeys(reference))}
+    return result
+
+
+def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, Values]]:
+    """Cells of pooled sets, row -> place -> metric -> mean and standard error; only where every log has its features.
+
+    Args:
+        logs: per log its facts, with ``features[row][place]`` as from `files_at`. out: folder of the benchmark.
+    """
+    result: dict[str, dict[str, Values]] = {}
+    for row, places in {row: of for entry in logs for row, of in entry["features"].items()}.items():
+        for place in places:
+            for entry in POOLED:
+                files = [one["features"].get(row, {}).get(place, {}).get(entry) for one in logs]
+                if any(of is None for of in files):
+                    continue
+                made, reference = _sets(files, out, row == TRUTH)
+                if min(len(made), len(reference)) < FEWEST:
+                    continue
+                cells = result.setdefault(row, {}).setdefault(place, {})
+                if entry == "videos":
+                    cells["fvd"] = {"mean": compared(made, reference)["fvd"], "standard_error": None}
+                else:
+                    both = distances(made, reference)
+                    cells["fid"] = {"mean": round(both.fid, 6), "standard_error": None}
+                    cells["kid"] = {"mean": round(both.kid, 6), "standard_error": both.kid_standard_error}
+    return result
+
+
+def _sets(
+    files: Sequence[Mapping[str, Sequence[str]]], out: Path, is_truth: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Features f32[n, d] of all views, and of all recorded frames. Truth that was not made compares every second recorded frame with the
+    others."""
+    read = lambda part: [store.read_safetensors(out / name)["features"] for of in files for name in of[part]]  # noqa: E731
+    made, reference = read("made"), read("reference")
+    if is_truth and not made:
+        made, reference = [rows[::2] for rows in reference], [rows[1::2] for rows in reference]
+    return np.concatenate(made), np.concatenate(reference)
+
+
+# ---- all logs ----
+
+
+def document(
+    table: PaperTable, logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], settings: Mapping[str, Any],
+    pooled: Mapping[str, Mapping[str, Values]] = MappingProxyType({}),
+) -> dict[str, Any]:  # fmt: skip
+    """Everything ``bench.json`` holds.
+
+    Args:
+        logs: per log its facts, ``exact``, ``values[row][place][key]`` as from `at_place`, ``made``, ``films``, ``columns``, seconds.
+        rows: name, title, method and changes of what was computed. settings: of the benchmark.
+        pooled: row -> place -> metric -> mean and standard error of the sets of all logs together, where there are such.
+
+    Raises:
+        InputError: methods have different numbers of views.
+    """
+    exact = all(entry["exact"] for entry in logs)
+    every = [*({"name": name, "title": title, "method": "", "changes": {}} for name, title in ANCHORS.items()), *rows]
+    columns = further_columns(exact)
+    wanted = [*((p.name, c) for p, c in table.cells()), *((place.name, column) for place in table.places for column in columns)]
+    cells: dict[str, dict[str, Values]] = {row["name"]: {} for row in every}
+    for row, of in cells.items():
+        for place, column in wanted:
+            together = pooled.get(row, {}).get(place, {}).get(column.key)
+            of.setdefault(place, {})[column.key] = _cell(logs, row, place, column, together)
+    best: dict[str, dict[str, list[str]]] = {}
+    for place, column in wanted:
+        _refuse_other_counts(cells, place, column)
+        numbers = {row: round(of[place][column.key]["mean"], column.digits) for row, of in cells.items()
+                   if row != TRUTH and "mean" in of[place][column.key]}  # fmt: skip
+        best.setdefault(place, {})[column.key] = best_of(column.better, numbers)
+    published = [{"title": row.title, "source": row.source, "values": list(map(list, row.values))} for row in table.published]
+    return {
+        "schema": 1, "bench": "paper", "table": table.values(), "exact": exact, "settings": dict(settings), "rows": every,
+        "cells": cells, "best": best, "further": [column.values() for column in columns],
+        "further_title": "Exact truth" if exact else "Measured at LiDAR points and in recorded frames",
+        "published": published, "made": logs[0]["made"], "logs": [dict(entry) for entry in logs],
+    }  # fmt: skip
+
+
+def _cell(
+    logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn, pooled: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Mean over all logs, or the value of their ``pooled`` sets; or the reason why there is none."""
+    values = [entry["values"][row][place].get(column.key, {"value": NOT_SCORED}) for entry in logs]
+    if row == TRUTH and column.key in BY_DEFINITION:
+        return {"reason": SELF}
+    reasons = [one["value"] for one in values if isinstance(one["value"], str)]
+    if reasons:
+        few = f" ({len(reasons)} of {len(values)} logs)" if len(reasons) < len(values) else ""
+        return {"reason": reasons[0] + few}
+    numbers = [one["value"] for one in values]
+    counts = {key: [one[key] for one in values] for key in ("n", "n_reference") if key in values[0]}
+    result = {"mean": fmean(numbers), "standard_error": standard_error(fmean, numbers), "logs": len(numbers), **counts}
+    return result if pooled is None else {**result, **pooled, "mean_over_logs": fmean(numbers)}
+
+
+def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: PaperColumn) -> None:
+    """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table, with the reason.
+
+    Raises:
+        InputError: they differ.
+    """
+    counts = {name: of[place][column.key].get("n") for name, of in cells.items()}
+    floor = counts.pop(TRUTH)
+    wanted = {tuple(n) for n in counts.values() if n is not None}
+    if len(wanted) > 1:
+        raise InputError(
+            "methods with different numbers of views cannot stand in one table", where=f"{column.title} at {place}",
+            expected="the same n on every log", got=", ".join(f"{name}: {sum(n)}" for name, n in counts.items() if n is not None),
+            remedy="make the table anew with --overwrite",
+        )  # fmt: skip
+    if floor is not None and wanted and tuple(floor) not in wanted:
+        cells[TRUTH][place][column.key] = {"reason": OTHER_N, "floor": cells[TRUTH][place][column.key]}
+
+
+# ---- texts ----
+
+
+def heading(doc: Mapping[str, Any]) -> str:
+    """What the table is, and what it is filled with."""
+    count, name = len(doc["logs"]), doc["settings"]["list"]
+    logs = f"{count} log{'s' if count != 1 else ''}"
+    return f"{doc['table']['title']}, on {logs} of generated cities ({name})" if name else f"{doc['table']['title']}, on {logs} recorded"
+
+
+def notes_of(doc: Mapping[str, Any]) -> list[str]:
+    """What is to be said of a table, one sentence or two per line."""
+    table, settings = doc["table"], doc["settings"]
+    sizes = dict.fromkeys(f"{e['size']}, {e['frames']} frames, {e['held_out']} images held out" for e in doc["logs"])
+    ours = "generated cities, not the paper's data" if settings["list"] else "the logs below"
+    missing = ", ".join(settings["missing_scenes"])
+    return [
+        f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by number.",
+        f"Every fit has {settings['iterations']} iterations, {virtual_fits_of(settings)}; seed {settings['seed']}.",
+        "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows are not ranked.",
+        *table["notes"],
+        *(f"{', '.join(titles)} ({NONE}): {reason}." for reason, titles in _empty_columns(doc).items()),
+        *_notes_of_sets(doc["made"]),
+        *(f"{entry['log']}: {entry['note']}." for entry in doc["logs"] if entry["note"]),
+        *([f"Segments of list {table['scenes']} that were not given: {missing}."] if missing else []),
+    ]
+
+
+def _notes_of_sets(made: Mapping[str, Any]) -> list[str]:
+    notes, sets, videos = [], made.get("distributions"), made.get("videos")
+    if sets:
+        whose = "published weights" if sets["published_weights"] else "weights that are not the published file"
+        notes.append(
+            f"FID, KID and FVD: all logs' views of a place are one set, against all recorded frames of their cameras; "
+            f"{whose} ({sets['weights_sha256'][:12]}), resize rule {sets['resize']}, "
+            f"covariance with {sets['covariance']}. FID of few frames is mostly bias: read it beside the truth itself."
+        )  # fmt: skip
+    if videos:
+        notes.append(
+            f"FVD: clips of {videos['clip_frames']} views, one at every {videos['hop_frames']}th; weights {videos['weights_sha256'][:12]}, "
+            f"resize rule {videos['resize']}, epsilon {videos['norm_epsilon']:g}."
+        )
+    return notes
+
+
+def _columns(doc: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    return {column["key"]: column for column in (*doc["further"], *doc["table"]["columns"])}
+
+
+def _shared_reason(doc: Mapping[str, Any], place: str, key: str) -> str:
+    """Why no row at all has a number in a column; empty if one has, or if reasons differ."""
+    reasons = {of[place][key].get("reason", "") for of in doc["cells"].values()}
+    return reasons.pop() if len(reasons) == 1 else ""
+
+
+def _empty_columns(doc: Mapping[str, Any]) -> dict[str, dict[str, None]]:
+    """Reason -> titles of the columns in which no row has a number."""
+    wanted = [*doc["table"]["cells"], *((p["name"], c["key"]) for p in doc["table"]["places"] for c in doc["further"])]
+    of: dict[str, dict[str, None]] = {}
+    for place, key in wanted:
+        if reason := _shared_reason(doc, place, key):
+            of.setdefault(reason, {})[_columns(doc)[key]["title"]] = None
+    return of
+
+
+def main_table(doc: Mapping[str, Any]) -> TextTable:
+    """The table: published rows, ours, and the numbers of views."""
+    wanted, columns = [tuple(cell) for cell in doc["table"]["cells"]], _columns(doc)
+    titles = {place["name"]: place["title"] for place in doc["table"]["places"]}
+    heads = ["", *(f"{_headed(columns[key])}, {titles[place]}" for place, key in wanted)]
+    lines = []
+    for row in doc["published"]:
+        values = {(place, key): value for place, key, value in row["values"]}
+        if values.keys() & set(wanted):
+            cells = tuple(TextCell(_digits(values[cell], columns[cell[1]]) if cell in values else "") for cell in wanted)
+            lines.append(TextLine(f"{row['title']} ({PUBLISHED}: {row['source']})", cells, PUBLISHED))
+    return TextTable(tuple(heads), (*lines, *_ours(doc, wanted)))
+
+
+def further_tables(doc: Mapping[str, Any]) -> list[TextTable]:
+    """The further columns, one table per place."""
+    columns = doc["further"]
+    return [
+        TextTable(("", *map(_headed, columns)), tuple(_ours(doc, [(place["name"], column["key"]) for column in columns])), place["title"])
+        for place in doc["table"]["places"] if columns
+    ]  # fmt: skip
+
+
+def _headed(column: Mapping[str, Any]) -> str:
+    return f"{column['title']} {ARROWS[column['better']]}"
+
+
+def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
+    shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
+    for row in doc["rows"]:
+        cells = (TextCell(NONE, reason=shared[cell]) if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)
+        yield TextLine(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
+    yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
+
+
+def _printed(doc: Mapping[str, Any], row: str, place: str, key: str) -> TextCell:
+    result, column = doc["cells"][row][place][key], _columns(doc)[key]
+    if "mean" not in result:
+        return TextCell(result["reason"], reason=result["reason"])
+    error = result["standard_error"]
+    behind = "" if error is None else f" ({_digits(error, column)})"
+    return TextCell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
+
+
+def _digits(value: float, column: Mapping[str, Any]) -> str:
+    return f"{value:.{column['digits']}f}"
+
+
+def _count(doc: Mapping[str, Any], place: str, key: str) -> str:
+    """Views (or clips) behind the numbers of a column, over all logs; the same for every row that has one."""
+    counts = next((of[place][key] for of in doc["cells"].values() if "n" in of[place][key]), None)
+    if counts is None:
+        return NONE
+    reference = counts.get("n_reference")
+    return str(sum(counts["n"])) + (f" against {sum(reference)}" if reference else "")
+
+
+LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "images held out", "tracked boxes", "seconds")
+
+
+def _log_cells(entry: Mapping[str, Any]) -> list[str]:
+    """A log's row under ``LOG_HEADS``."""
+    facts = [str(entry[key]) for key in ("frames", "size", "held_out", "tracks")]
+    return [entry["log"], entry["dataset"], ", ".join(entry["cameras"]), *facts, f"{sum(entry['seconds'].values()):.0f}"]
+
+
+def markdown(doc: Mapping[str, Any]) -> str:
+    """The table for people."""
+    lines = [f"# {heading(doc)}", "", *(f"* {note}" for note in notes_of(doc)), "", *rendered(main_table(doc)), ""]
+    for table in further_tables(doc):
+        lines += [f"## {doc['further_title']}: {table.title}", "", *rendered(table), ""]
+    return "\n".join([*lines, "## Logs", "", *markdown_table(LOG_HEADS, map(_log_cells, doc["logs"])), ""])
+
+
+def as_latex(doc: Mapping[str, Any]) -> str:
+    """The tables as LaTeX ``tabular``; notes as comments above them."""
+    further = [replace(table, title=f"{doc['further_title']}: {table.title}") for table in further_tables(doc)]
+    lines = [f"% {note}" for note in (heading(doc), *notes_of(doc))]
+    for table in (main_table(doc), *further):
+        lines += [*latex(table), ""]
+    return "\n".join(lines)
+
+
+def as_csv(doc: Mapping[str, Any]) -> str:
+    """One line per number: ``kind,row,source,place,metric,value,standard_error,logs,n,n_reference,reason,best``."""
+    rows: list[list[Any]] = []
+    for row in doc["published"]:
+        rows += [[PUBLISHED, row["title"], row["source"], place, key, value, *[""] * 6] for place, key, value in row["values"]]
+    for row in doc["rows"]:
+        for place, of in doc["cells"][row["name"]].items():
+            for key, result in of.items():
+                numbers = ["" if (value := result.get(name)) is None else f"{value:.6g}" for name in ("mean", "standard_error")]
+                counts = [sum(result[name]) if name in result else "" for name in ("n", "n_reference")]
+                last = [result.get("logs", ""), *counts, result.get("reason", ""), int(row["name"] in doc["best"][place][key])]
+                rows.append(["ours" if row["method"] else "anchor", row["name"], "", place, key, *numbers, *last])
+    return csv_text("kind row source place metric value standard_error logs n n_reference reason best".split(), rows)
+
+
+def page(doc: Mapping[str, Any]) -> str:
+    """The whole page from what ``bench.json`` holds."""
+    lead, *notes = notes_of(doc)
+    further = [{"title": doc["further_title"], "tables": further_tables(doc)}] if doc["further"] else []
+    return pages.render(
+        heading(doc), f"mudg bench paper --table {doc['table']['name']}", lead,
+        [
+            {"title": "Table", "tables": [main_table(doc)], "below": notes}, *further,
+            pages.films(doc, doc["logs"][0]["columns"], videos=doc["settings"]["videos"], exact=doc["exact"]),
+            {"title": "Logs", "tables": [TextTable.of_texts(LOG_HEADS, map(_log_cells, doc["logs"]))]},
+        ],
+        "The pictures lie beside this page.",
+    )  # fmt: skip

@@ -1,0 +1,376 @@
+"""The logs of benchmarks: lists of generated cities and recorded logs, their scenes, and what of a log the methods do not see.
+
+OUT/<log>/imported   a dataset's log as a scene      OUT/<log>/shown   a table's frames, cameras and held-out rule
+OUT/<log>/scene      the same with the labels that it lacks; of a city, the generated log itself
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from mudg.base import store
+from mudg.base.devices import DeviceName
+from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.types import Frame, Scene
+from mudg.benchmarks.loop import step
+from mudg.benchmarks.papers import SCENE_LISTS, PaperTable
+from mudg.data.city import logs as city_logs
+from mudg.data.city.logs import STANDARD, LogRules
+from mudg.data.importers.options import holdout_split, parse_frame_range, parse_resolution
+from mudg.data.scene import SCENE_FILES, read_scene
+from mudg.data.scene.part import write_part
+from mudg.stages import annotate, ingest
+from mudg.stages.config import AnnotateConfig, BenchConfig, IngestConfig, on_device
+
+CITY: Final = "city:"
+"""How the name of a list of generated cities begins."""
+SHOWN_BETWEEN: Final = 3
+"""Fewest shown moments before, between and after blocks of held-out ones, where a log is long enough for it."""
+_SHOWN: Final = VerbOutput("frames of a table", 1, SCENE_FILES)
+_NAME: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
+
+
+# ---- which logs ----
+
+
+@dataclass(frozen=True)
+class ListedCity:
+    """A generated log: its seed and what it is recorded with."""
+
+    name: str
+    seed: int
+    rules: LogRules
+    side: int = 1
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class RecordedLog:
+    """A recorded log.
+
+    Args:
+        name: of its folder. source: a dataset's log or a scene. frames: first and last frame (both included), or None for all. size: of
+            imported images (empty = as recorded). side: of one-sided shifts. note: what is to be said of it.
+    """
+
+    name: str
+    source: Path
+    frames: tuple[int, int] | None
+    size: str
+    side: int
+    note: str
+
+
+Log = ListedCity | RecordedLog
+
+
+def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> tuple[Log, ...]:
+    """The logs that a table is filled with.
+
+    Args:
+        sources: ``city:NAME`` alone (see ``data/city/logs.py``), or folders of recorded logs.
+
+    Raises:
+        UsageError: no log, an unknown list, lists and folders together, or settings that make no sense for them.
+    """
+    names = [str(source) for source in sources]
+    lists = [name.removeprefix(CITY) for name in names if name.startswith(CITY)]
+    if not names or (lists and len(names) > 1):
+        raise UsageError(
+            "a list of cities stands alone" if names else "no logs to fill the table with", where=f"mudg bench paper --table {table.name}",
+            expected=f"{CITY}reported, {CITY}development, or folders of logs", got=" ".join(names),
+        )  # fmt: skip
+    if lists:
+        return _cities(config, lists[0], table)
+    if config.logs != BenchConfig().logs:
+        raise UsageError("recorded logs are counted by naming them", where="--logs", got=str(config.logs), remedy="leave it out")
+    return tuple(_recorded(config, name, source, table) for name, source in names_of(sources).items())
+
+
+def _cities(config: BenchConfig, name: str, table: PaperTable) -> tuple[Log, ...]:
+    if name not in city_logs.LISTS:
+        raise UsageError("no such list of cities", expected=", ".join(CITY + known for known in city_logs.LISTS), got=CITY + name)
+    size, frames = parse_resolution(config.resolution), parse_frame_range(config.frames)
+    if isinstance(size, int) or (frames is not None and frames[0] != 0):
+        raise UsageError("a generated city takes a whole size and frames from 0 on", expected="--resolution WIDTHxHEIGHT, --frames 0:END",
+                         got=f"{config.resolution} {config.frames}".strip())  # fmt: skip
+    width, height = size or (STANDARD.width, STANDARD.height)
+    cameras = ("front",) if table.front_only else STANDARD.cameras
+    return listed_cities(name, config.logs, LogRules(frames[1] if frames else STANDARD.frames, width, height, cameras))
+
+
+def listed_cities(name: str, count: int, rules: LogRules) -> tuple[Log, ...]:
+    """The first cities of a list."""
+    return tuple(ListedCity(str(seed), seed, rules) for seed in city_logs.LISTS[name][:count])
+
+
+def _recorded(config: BenchConfig, name: str, source: Path, table: PaperTable) -> RecordedLog:
+    limits = parse_frame_range(config.frames)
+    frames = (limits[0], limits[1] - 1) if limits else None
+    segments, note = SCENE_LISTS.get(table.scenes, ()), ""
+    segment = next((one for one in segments if one.segment in _identity(source)), None)
+    if segment is not None and frames is None:
+        frames = (segment.first, segment.last)
+    elif segments and segment is None:
+        note = f"not in the table's list {table.scenes}"
+    elif segment is not None and frames != (segment.first, segment.last):
+        note = f"the table's frames are {segment.first} to {segment.last}"
+    if config.resolution and ingest.is_scene(source):
+        raise UsageError("a scene's images keep their size", where=str(source), got="--resolution",
+                         remedy="leave it out, or give the dataset's own folder")  # fmt: skip
+    size = "" if ingest.is_scene(source) else config.resolution or table.size
+    return RecordedLog(name, source, frames, size, 1 if segment is None else segment.side, note)
+
+
+def _identity(source: Path) -> str:
+    """Text in which a segment's name is looked for: the path's name, and a scene's id."""
+    return f"{source.name} {read_scene(source).id if ingest.is_scene(source) else ''}"
+
+
+def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
+    """Segments of the table's list that no recorded log belongs to; none where cities are scored."""
+    identities = " ".join(_identity(log.source) for log in logs if isinstance(log, RecordedLog))
+    return [one.segment for one in SCENE_LISTS.get(table.scenes, ()) if identities and one.segment not in identities]
+
+
+def names_of(sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")) -> dict[str, Path]:
+    """Name -> log: the last part of its path, in characters that every file system takes.
+
+    Raises:
+        UsageError: no log, two of one name, or one that is the name of a page.
+    """
+    if not sources:
+        raise UsageError("no log was given", expected="mudg bench real LOG... --out FOLDER")
+    named: dict[str, Path] = {}
+    for source in map(Path, sources):
+        last = source.resolve().stem if source.suffix == ".zip" else source.resolve().name
+        name = _NAME.sub("_", last).strip("._-") or "log"
+        if name in named or name in pages:
+            raise UsageError("two logs have the same name", where=str(source), got=name,
+                             remedy="rename one, or prepare it with mudg ingest in a folder of another name")  # fmt: skip
+        named[name] = source
+    return named
+
+
+# ---- scenes ----
+
+
+def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overwrite: bool) -> Path:
+    """The scene of a log under the rules of a table, made if need be.
+
+    Args:
+        out: folder of the log. device: of the labeller's network. overwrite: replace what other settings left there.
+
+    Raises:
+        InputError: the log has fewer frames than the table asks for. Whatever a verb raises.
+    """
+    if isinstance(log, ListedCity):
+        settings = IngestConfig(test_every=table.held_out_every, city=city_logs.log_config(log.seed, log.rules))
+        return step(ingest.run, settings, ingest.CITY, out / "scene", overwrite=overwrite)
+    refuse_overlap(out, {"log": log.source})
+    whole, frames = log.source, log.frames
+    if not ingest.is_scene(whole):
+        text = "" if frames is None else f"{frames[0]}:{frames[1] + 1}"
+        settings = IngestConfig(test_every=0, resolution=log.size, frames=text)
+        whole, frames = step(ingest.run, settings, log.source, out / "imported", overwrite=overwrite), None
+    shown = step(_write_shown, whole, frames, table, out / "shown", overwrite=overwrite)
+    return labelled(shown, out / "scene", device, overwrite)
+
+
+def labelled(scene: Path, out: Path, device: DeviceName, overwrite: bool) -> Path:
+    """A scene as it is, or a copy with the labels that it lacks in its training frames."""
+    settings = on_device(AnnotateConfig(processes=1), device)
+    if all(annotate.wanted_labels(settings) <= set(frame.labels) for frame in read_scene(scene).frames):
+        return scene
+    return step(annotate.run, settings, scene, out, overwrite=overwrite)
+
+
+def imported(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> Path:
+    """A log as a scene: as it is, or imported with the settings of this configuration."""
+    if not ingest.is_scene(source):
+        settings = IngestConfig(resolution=config.resolution, frames=config.frames, test_every=0)
+        return step(ingest.run, settings, source, out, overwrite=overwrite)
+    if config.resolution or config.frames:
+        raise UsageError("a scene is taken as it is", where=str(source), got="--resolution or --frames",
+                         remedy="leave them out, or give the dataset's own folder")  # fmt: skip
+    return source
+
+
+def _write_shown(
+    whole: Path, frames: tuple[int, int] | None, table: PaperTable, out: Path, *, overwrite: bool = False
+) -> Path:
+    """The table's frames of a scene, with its rule of what is held out."""
+    rules = {"frames": frames, "held_out_every": table.held_out_every, "front_only": table.front_only}
+    folder = RunDir.open(out, _SHOWN, rules, {"scene": store.digest(whole)}, overwrite)
+    if folder.complete:
+        return folder.reused()
+    scene = read_scene(whole)
+    camera = first_camera(scene, ())
+    times = np.array(sorted(frame.view.time_s for frame in scene.frames_of(camera)))
+    first, last = frames or (0, len(times) - 1)
+    if frames is not None and len(times) == last - first + 1:
+        first, last = 0, len(times) - 1  # imported with these very frames
+    if last >= len(times):
+        raise InputError("the log has fewer frames than the table asks for", where=str(whole), expected=f"frames {first} to {last}",
+                         got=f"{len(times)} frames of camera {camera}", remedy="give the whole log, or choose --frames")  # fmt: skip
+    moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
+    chosen = [
+        frame for frame in scene.frames
+        if first <= moment(frame.view.time_s) <= last and (not table.front_only or frame.view.camera.name == camera)
+    ]  # fmt: skip
+    sweeps = [sweep.id for sweep in scene.sweeps if first <= moment(sweep.time_s) <= last]
+    groups = [[f.id for f in chosen if moment(f.view.time_s) == number] for number in range(first, last + 1)]
+    held = [name for name, part in holdout_split(groups, table.held_out_every).items() if part == "test"]
+    write_part(scene, folder.path, {frame.id for frame in chosen}, sweeps, held_out=held)
+    folder.finish({"frames": len(chosen), "held_out": len(held)})
+    return folder.path
+
+
+# ---- what is hidden of a real log, and scored ----
+
+MapName = Literal["photo", "depth", "seen", "dynamic", "color", "classes"]
+
+
+@dataclass(frozen=True)
+class Split:
+    """What of a log the methods see.
+
+    Args:
+        name: also of its folder. block: length of the blocks of held-out moments (0 = none). by_camera: only the chosen cameras are
+            shown. all_cameras: views of all cameras are asked for that have held-out frames; else of the first camera.
+        shifts_m: lateral shifts of the views that are asked for, metres, positive to the left.
+    """
+
+    name: str
+    block: int = 0
+    by_camera: bool = False
+    all_cameras: bool = True
+    shifts_m: tuple[float, ...] = (0.0,)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Which views are scored, against what, in which columns.
+
+    Args:
+        name: in tables. family: as asked for with ``--protocols``. title: heading. split: name of a ``Split``.
+        shifts_m: lateral shifts of the scored views. every: every n-th view of a camera counts, beginning with the second where n > 1.
+        maps: what the truth of a view holds. columns: names in ``columns.COLUMNS``, in the order of the table.
+        pooled: a log's value is that of all its places together, so that a place weighs what it adds to the sums; else their mean.
+    """
+
+    name: str
+    family: str
+    title: str
+    split: str
+    maps: tuple[MapName, ...]
+    columns: tuple[str, ...]
+    shifts_m: tuple[float, ...] = (0.0,)
+    every: int = 1
+    pooled: bool = False
+
+
+SPLITS: Final[dict[str, Split]] = {
+    "gap-1": Split("gap-1", block=1),
+    "gap-3": Split("gap-3", block=3),
+    "gap-5": Split("gap-5", block=5),
+    "camera": Split("camera", by_camera=True),
+    "all": Split("all", all_cameras=False, shifts_m=(0.0, 2.0, -2.0, 3.0, -3.0)),
+}
+_GAP: Final = ("psnr", "ssim", "perceptual", "psnr_dynamic", "psnr_upper", "abs_rel")
+_CAMERA: Final = ("psnr_seen", "perceptual_seen", "abs_rel_seen", "rmse_seen", "delta1_seen")
+_LIDAR: Final = (
+    "abs_rel_static", "rmse_static", "delta1_static", "abs_rel_dynamic", "rmse_dynamic", "delta1_dynamic", "point_psnr_static",
+    "point_abs_static", "point_psnr_dynamic", "point_abs_dynamic",
+)  # fmt: skip
+PROTOCOLS: Final[tuple[Protocol, ...]] = (
+    Protocol("gap-1", "gap", "Single held-out frames", "gap-1", ("photo", "depth", "dynamic"), _GAP),
+    Protocol("gap-3", "gap", "Blocks of 3 held-out frames", "gap-3", ("photo", "depth", "dynamic"), _GAP),
+    Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", ("photo", "depth", "dynamic"), _GAP),
+    Protocol("camera", "camera", "Cameras that the methods never saw", "camera", ("photo", "depth", "seen"), _CAMERA, every=2, pooled=True),
+    Protocol("lidar", "lidar", "LiDAR beside the recorded path", "all", ("depth", "dynamic", "color"), _LIDAR, (2.0, -2.0, 3.0, -3.0)),
+    Protocol("classes", "classes", "Classes of LiDAR points", "all", ("classes",), ("miou", "accuracy")),
+)  # fmt: skip
+
+
+def protocols_of(names: Sequence[str]) -> tuple[Protocol, ...]:
+    """Protocols by name or family. UsageError if there is none of a name."""
+    known = dict.fromkeys(name for protocol in PROTOCOLS for name in (protocol.family, protocol.name))
+    unknown = sorted(set(names) - set(known))
+    if unknown or not names:
+        raise UsageError("unknown protocol", where="--protocols", expected=", ".join(known), got=", ".join(unknown))
+    return tuple(protocol for protocol in PROTOCOLS if {protocol.family, protocol.name} & set(names))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What a split hides of a log: ids of frames and sweeps, and facts for people. ``reason``: why the log cannot be split so."""
+
+    frames: tuple[str, ...] = ()
+    sweeps: tuple[str, ...] = ()
+    facts: tuple[tuple[str, Any], ...] = ()
+    reason: str = ""
+
+    def places(self, scene: Scene) -> tuple[Frame, ...]:
+        """The held-out frames of a scene."""
+        hidden = set(self.frames)
+        return tuple(frame for frame in scene.frames if frame.id in hidden)
+
+
+def blocks_of(moments: int, length: int) -> tuple[range, ...]:
+    """Blocks of ``length`` held-out moments, spread evenly among ``moments``; the first and the last one are shown.
+
+    As many as leave ``SHOWN_BETWEEN`` shown moments before, between and after them, but at least one; none where it does not fit.
+    """
+    if moments < length + 2:
+        return ()
+    count = max(1, (moments - SHOWN_BETWEEN) // (length + SHOWN_BETWEEN))
+    shown = moments - count * length
+    starts = [round((i + 1) * shown / (count + 1)) + i * length for i in range(count)]
+    return tuple(range(start, start + length) for start in starts)
+
+
+def shown_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[str, ...]:
+    """The cameras that are shown by the split by cameras: those asked for, else ``front``, else the first."""
+    return tuple(wanted) or (("front",) if "front" in scene.cameras else tuple(scene.cameras)[:1])
+
+
+def first_camera(scene: Scene, wanted: Sequence[str]) -> str:
+    """The camera of the views beside the recorded path."""
+    return shown_cameras(scene, wanted)[0]
+
+
+def held_out(scene: Scene, split: Split, wanted: Sequence[str]) -> HeldOut:
+    """What a split hides of a scene; ``wanted`` are the cameras to show by the split by cameras (empty = the default)."""
+    if split.by_camera:
+        shown = shown_cameras(scene, wanted)
+        hidden = [name for name in scene.cameras if name not in shown]
+        frames = tuple(frame.id for frame in scene.frames if frame.view.camera.name in hidden)
+        facts = (("shown_cameras", list(shown)), ("hidden_cameras", hidden), ("held_out_frames", len(frames)))
+        return HeldOut(frames, (), facts, "" if frames else "the log has no camera besides those that are shown")
+    return _hidden_blocks(scene, split.block) if split.block else HeldOut()
+
+
+def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
+    """Moments are the times of the camera with the fewest frames; every frame and sweep belongs to the nearest one."""
+    name = min((n for n in scene.cameras if scene.frames_of(n)), key=lambda n: len(scene.frames_of(n)))
+    times = np.array([frame.view.time_s for frame in scene.frames_of(name)])
+    blocks = blocks_of(len(times), length)
+    if not blocks:
+        return HeldOut(reason=f"its {len(times)} frames are too few for a block of {length} between shown ones")
+    hidden = {moment for block in blocks for moment in block}
+    is_hidden = lambda time_s: int(np.argmin(np.abs(times - time_s))) in hidden  # noqa: E731
+    frames = tuple(frame.id for frame in scene.frames if is_hidden(frame.view.time_s))
+    sweeps = tuple(sweep.id for sweep in scene.sweeps if is_hidden(sweep.time_s))
+    facts = (
+        ("moments", len(times)), ("blocks", [[block.start, block.stop - 1] for block in blocks]),
+        ("held_out_frames", len(frames)), ("held_out_sweeps", len(sweeps)),
+    )  # fmt: skip
+    return HeldOut(frames, sweeps, facts)

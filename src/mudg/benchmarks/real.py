@@ -1,0 +1,440 @@
+"""``mudg bench real``: complete methods on real logs, against what the log recorded and the methods did not see.
+
+A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log and way of
+hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is hidden was removed
+(``data/scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
+
+    OUT/<log>/scene                                         the whole log; read by truth and scores alone
+    OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out frames
+    OUT/<log>/<split>/fuse adapt fit/<method> virtual/<sees>   what methods make of it; what the diffusion model sees
+    OUT/<log>/<split>/nearest_fill generated/<sees> render/<method>   the views to score
+    OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
+    OUT/bench.json  OUT/bench.md  OUT/page.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from mudg.base import config as configuration
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.types import Scene
+from mudg.benchmarks import page as pages
+from mudg.benchmarks.chain import Chain
+from mudg.benchmarks.columns import COLUMNS, mean_values, write_scores
+from mudg.benchmarks.loop import compare, refuse_foreign, step
+from mudg.benchmarks.places import (
+    SPLITS,
+    HeldOut,
+    Protocol,
+    Split,
+    first_camera,
+    held_out,
+    imported,
+    labelled,
+    names_of,
+    protocols_of,
+)
+from mudg.benchmarks.rows import BASE, FILL, Row, Sees, chain_settings, generator_of, real_rows, refuse_unfit
+from mudg.benchmarks.shift import virtual_fits_of
+from mudg.benchmarks.truth import read_targets, write_targets
+from mudg.data.scene import SCENE_FILES, read_scene
+from mudg.data.scene.part import write_part
+from mudg.models.mdm import files as mdm_files
+from mudg.pages.tables import TextTable, markdown_table
+from mudg.pages.tables import markdown as rendered
+from mudg.stages import adapt, render
+from mudg.stages.adapting.clips import why_not
+from mudg.stages.config import AdaptConfig, BenchConfig, PresetName, RenderConfig, on_device
+
+PAGES: Final = ("bench.json", "bench.md", "page.html")
+_PART: Final = VerbOutput("part of a scene", 1, SCENE_FILES)
+
+
+def run(
+    config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False,
+    adaptation: AdaptConfig | None = None,
+) -> Path:  # fmt: skip
+    """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
+
+    Args:
+        config: see ``BenchConfig``; fields marked real, and model, precision and seed. preset: what it started from.
+        sources: folders of dataset logs, or scenes made by ``mudg ingest``.
+        out: what lies there of the same settings is reused; logs, protocols and methods may be added later.
+        overwrite: replace what other settings left there.
+        adaptation: how the diffusion model is adapted to a log; its model, cameras, precision and seed are those of ``config``.
+
+    Raises:
+        UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one name, or ``out`` holds something
+            else. Whatever a verb raises.
+    """
+    rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}})
+    refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
+    generates = any(row.sees and row.fit is None for row in rows)
+    refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
+    training = replace(adaptation or AdaptConfig(), model=config.model, processes=1, seed=config.seed)
+    if mdm_files.uses_renders(config.model):  # no other model is adapted
+        training = replace(training, precision=config.precision)
+    scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
+    jobs = [
+        SplitJob(
+            out / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, config,
+            on_device(training, config.device), overwrite,
+        )
+        for name, scene in scenes.items() for split in dict.fromkeys(protocol.split for protocol in protocols)
+    ]  # fmt: skip
+    settings = {
+        "protocols": list(config.protocols), "iterations": config.iterations, "seed": config.seed,
+        "model": mdm_files.digest(config.model), "shown_cameras": list(config.shown), "resolution": config.resolution,
+        "frames": config.frames, "virtual_shifts_m": list(config.synthesize.shifts_m), **chain_settings(config, preset),
+    }  # fmt: skip
+
+    def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
+        of_log = {name: [result for job, result in zip(jobs, measured) if job.out.name == name] for name in scenes}
+        return document([_entry(name, scenes[name], of_log[name]) for name in scenes], list(map(_row_values, rows)), protocols, settings)
+
+    return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
+
+
+# ---- one log under one way of hiding ----
+
+
+@dataclass(frozen=True)
+class DiffusionUse:
+    """How a method uses the diffusion model on a log: what is left of what it asks for, the model, and a sentence about it."""
+
+    sees: Sees
+    model: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class SplitJob:
+    """Everything of one log under one way of hiding."""
+
+    out: Path
+    source: Path
+    split: Split
+    protocols: tuple[Protocol, ...]
+    rows: tuple[Row, ...]
+    config: BenchConfig
+    adapt: AdaptConfig
+    overwrite: bool
+
+    @property
+    def title(self) -> str:
+        """For the progress bar."""
+        return f"{self.out.name} {self.split.name}"
+
+    @property
+    def folder(self) -> Path:
+        """Of this way of hiding."""
+        return self.out / self.split.name
+
+    def chain(self) -> Chain:
+        """Its steps, on what the methods see; generated views lie beside the recorded path."""
+        scene = self.folder / "scene"
+        beside = replace(generator_of(self.config), cameras=(first_camera(read_scene(scene), self.config.shown),))
+        return Chain(self.folder, scene, self.config, self.overwrite, beside)
+
+    def measure(self) -> dict[str, Any]:
+        """Values by protocol and method, facts, and why protocols were left out."""
+        whole = read_scene(self.source)
+        held = held_out(whole, self.split, self.config.shown)
+        if held.reason:
+            left_out = {p.name: {"left_out": held.reason} for p in self.protocols}
+            return {"split": self.split.name, "held_out": {}, "diffusion": {}, "protocols": left_out}
+        self.write_seen(whole, held)
+        chain, cameras = self.chain(), self.cameras(whole, held)
+        truths, result = {}, {}
+        for protocol in self.protocols:
+            truth = chain.step(
+                write_targets, protocol, self.source, chain.scene, held.frames, cameras, self.out / "truth" / protocol.name
+            )
+            targets = read_targets(truth)
+            result[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
+            if len(targets):
+                truths[protocol.name] = truth
+            else:
+                result[protocol.name]["left_out"] = targets.reason
+        if truths:
+            chain.fuse()
+        used: dict[str, dict[str, str]] = {}
+        for row in self.rows if truths else ():
+            views, use = self.views(row, chain, cameras)
+            if use is not None:
+                used[row.name] = {"sees": use.sees, "note": use.note}
+            for protocol in (p for p in self.protocols if p.name in truths):
+                scored = chain.step(
+                    write_scores, protocol, self.source, truths[protocol.name], views, self.out / "score" / protocol.name / row.name,
+                    device=self.config.device,
+                )  # fmt: skip
+                result[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
+        return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": result}
+
+    def write_seen(self, whole: Scene, held: HeldOut) -> None:
+        """Write what the methods see: the shown frames and sweeps; these with the labels that they lack; the same with the places of
+        held-out frames; and these places alone (``asked``), for rendering."""
+        frames = {f.id for f in whole.frames} - set(held.frames)
+        sweeps = {s.id for s in whole.sweeps} - set(held.sweeps)
+        places, inputs = held.places(whole), {"log": store.digest(self.source)}
+        shown = self._write(self.folder / "shown", inputs, lambda root: write_part(whole, root, frames, sweeps))
+        labels = labelled(shown, self.folder / "annotate", self.config.device, self.overwrite)
+        seen, inputs = read_scene(labels), {"shown": store.digest(labels), **inputs}
+        self._write(self.folder / "scene", inputs, lambda root: write_part(seen, root, frames, sweeps, places))
+        if places:
+            self._write(self.folder / "asked", inputs, lambda root: write_part(whole, root, (), (), places))
+
+    def _write(self, out: Path, inputs: dict[str, str], write: Callable[[Path], Scene]) -> Path:
+        """Write a part of a scene as a folder that is verified and reused."""
+
+        def part(*, overwrite: bool = False) -> Path:
+            folder = RunDir.open(out, _PART, {"split": self.split.name, "shown": list(self.config.shown)}, inputs, overwrite)
+            if folder.complete:
+                return folder.reused()
+            scene = write(folder.path)
+            folder.finish({"frames": len(scene.frames), "sweeps": len(scene.sweeps)})
+            return folder.path
+
+        return step(part, overwrite=self.overwrite)
+
+    def cameras(self, whole: Scene, held: HeldOut) -> tuple[str, ...]:
+        """The cameras whose views are asked for."""
+        if not self.split.all_cameras:
+            return (first_camera(whole, self.config.shown),)
+        hidden = {frame.view.camera.name for frame in held.places(whole)}
+        return tuple(name for name in whole.cameras if name in hidden)
+
+    def views(self, row: Row, chain: Chain, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
+        """The folder with a method's views at all places that are asked for, made if need be; and how it used the diffusion model.
+
+        Fits learn from generated views beside the recorded path, and where views of hidden frames are asked for.
+        """
+        places = self.folder / "asked" if (self.folder / "asked").is_dir() else chain.scene
+        drawn = RenderConfig(cameras=cameras, shifts_m=self.split.shifts_m, video=False, device=self.config.device)
+        if row.name == FILL:
+            return chain.filled(render.trajectories(read_scene(places), drawn)), None
+        use, virtual = self.use(row.sees, chain) if row.sees else None, []
+        if use is not None:
+            scored = replace(chain.generator, cameras=cameras, shifts_m=self.split.shifts_m)
+            for folder, settings, needed in (
+                ("virtual", chain.generator, row.fit is not None),
+                ("generated", scored, row.fit is None or self.split.by_camera or self.split.block),
+            ):
+                if needed:
+                    made = replace(settings, model=use.model)
+                    virtual.append(chain.generated(made, self.folder / folder / use.sees, renders=use.sees != "points"))
+            if row.fit is None:
+                return virtual[0], use
+        return chain.rendered(row, virtual, drawn, places), use
+
+    def use(self, sees: Sees, chain: Chain) -> DiffusionUse:
+        """How the diffusion model is used where a method asks for ``sees``; adapted to what the method sees of the log if need be.
+
+        What the model or the log does not allow is left out, and the note says so.
+        """
+        model = self.config.model
+        if sees == "points":
+            return DiffusionUse("points", model)
+        if not mdm_files.uses_renders(model):
+            return DiffusionUse("points", model, "the model does not use renders, so it sees points alone")
+        if sees == "renders":
+            return DiffusionUse("renders", model)
+        scene = read_scene(chain.scene)
+        settings = replace(self.adapt, cameras=(first_camera(scene, self.config.shown),))
+        reason, folder = why_not(scene, settings), self.folder / "adapt"
+        if not reason:
+            first = chain.first()
+            try:
+                chain.step(adapt.run, settings, chain.scene, chain.fused, first, folder)
+            except InputError as error:
+                reason = f"{error.what}, {error.got}" if error.got else error.what
+        if reason:
+            return DiffusionUse("renders", model, f"the model was not adapted to the log: {reason}")
+        record = store.read_json(folder / "adapt.json")
+        numbers = f"{record['before']['psnr']:.2f} dB before, {record['after']['psnr']:.2f} dB after"
+        if not record["adapted"]:
+            return DiffusionUse("renders", model, f"adapting did not help ({numbers}), so the model was taken as it is")
+        return DiffusionUse("adapted", str(folder / "model"), f"the model was adapted ({numbers})")
+
+
+# ---- numbers ----
+
+
+def _row_values(row: Row) -> dict[str, Any]:
+    changes = configuration.result_settings(row.fit) if row.varied else None
+    return {"name": row.name, "title": row.title, "fit": "" if row.fit is None else row.method, "sees": row.sees, "changes": changes}
+
+
+def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A log with its facts and all its values."""
+    loaded = read_scene(scene)
+    cameras = {n: {"size_px": [c.width, c.height], "frames": len(loaded.frames_of(n))} for n, c in loaded.cameras.items()}
+    return {
+        "log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene), "cameras": cameras,
+        "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks), "held_out": {s["split"]: s["held_out"] for s in splits},
+        "diffusion": {s["split"]: s["diffusion"] for s in splits},
+        "protocols": {protocol: result for s in splits for protocol, result in s["protocols"].items()},
+    }  # fmt: skip
+
+
+def document(
+    logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], protocols: Sequence[Protocol], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Everything ``bench.json`` holds: per protocol, log and method the values by place and their mean; the means over the logs that have
+    a number; and differences (or ratios) to the fit without diffusion."""
+    names, result = [row["name"] for row in rows], {}
+    for protocol in protocols:
+        entries = {entry["log"]: entry["protocols"][protocol.name] for entry in logs}
+        counted = [entry["values"] for entry in entries.values() if "left_out" not in entry]
+        pooled = {name: mean_values([values[name]["mean"] for values in counted], protocol.columns) for name in names}
+        result[protocol.name] = {
+            "row": asdict(protocol), "logs": entries, "pooled": pooled,
+            "left_out": {log: entry["left_out"] for log, entry in entries.items() if "left_out" in entry},
+            "against": {
+                name: {c: COLUMNS[c].compared(pooled[name][c], pooled[BASE][c]) for c in protocol.columns}
+                for name in names if BASE in names and name != BASE
+            },
+        }  # fmt: skip
+    facts = [{key: value for key, value in entry.items() if key != "protocols"} for entry in logs]
+    return {"schema": 1, "bench": "real", "settings": dict(settings), "methods": list(rows), "logs": facts, "protocols": result}
+
+
+# ---- text ----
+
+
+def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping[str, Any]]) -> TextTable:
+    """A method's values, each in brackets with its comparison with the fit without diffusion."""
+    columns = doc["protocols"][protocol]["row"]["columns"]
+    rows = []
+    for method, of in values.items():
+        cells = [method]
+        for name in columns:
+            more = "" if method == BASE or BASE not in values else COLUMNS[name].compared_text(of[name], values[BASE][name])
+            cells.append(COLUMNS[name].text(of[name]) + (f" ({more})" if more else ""))
+        rows.append(cells)
+    return TextTable.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
+
+
+def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
+    """Sentences about a protocol: what was held out of each log, what was left out, and the colour maps of cameras."""
+    result, lines = doc["protocols"][protocol], []
+    for log in doc["logs"]:
+        name, split = log["log"], result["row"]["split"]
+        if name in result["left_out"]:
+            lines.append(f"{name} is left out: {result['left_out'][name]}.")
+            continue
+        held, facts = log["held_out"].get(split, {}), result["logs"][name]["facts"]
+        words = [f"{count} view{'' if count == 1 else 's'} of {place}" for place, count in facts["views"].items()]
+        if "blocks" in held:
+            blocks = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in held["blocks"])
+            words.append(f"held out of {held['moments']} frames: {blocks}")
+        if "shown_cameras" in held:
+            words.append("shown: " + ", ".join(held["shown_cameras"]))
+        words += [
+            f"{share:.0%} of {place} was seen, {facts['weight'].get(place, 0):.0%} of all seen pixels"
+            for place, share in facts["seen_share"].items()
+        ]
+        words += [
+            f"colour map of {place}: gain {' '.join(f'{g:.2f}' for g in of['gain'])}, offset {' '.join(f'{o:+.3f}' for o in of['offset'])}"
+            for place, of in facts["color_maps"].items()
+        ]
+        words += [f"{place} is left out ({reason})" for place, reason in facts["left_out"].items()]
+        lines.append(f"{name}: {'; '.join(words)}.")
+        notes: dict[str, list[str]] = {}
+        for method, use in log["diffusion"].get(split, {}).items():
+            notes.setdefault(use["note"], []).append(method)
+        lines += [f"{name}: {', '.join(methods)}: {note}." for note, methods in notes.items() if note]
+    return lines
+
+
+def heading_of(doc: Mapping[str, Any], protocol: str) -> str:
+    """Title of a protocol."""
+    return f"{protocol}: {doc['protocols'][protocol]['row']['title']}"
+
+
+def summary_of(doc: Mapping[str, Any]) -> str:
+    """One line about the whole."""
+    settings, count = doc["settings"], len(doc["logs"])
+    return (
+        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; "
+        f"seed {settings['seed']}."
+    )
+
+
+def markdown(doc: Mapping[str, Any]) -> str:
+    """The tables for people; those of single places stand only where a log has several."""
+    lines = [
+        "# Real logs", "",
+        f"{summary_of(doc)} In brackets: difference to {BASE}, or the ratio (x) where lower is better. Perceptual: features of the "
+        "shipped codec, not LPIPS.", "",
+        *markdown_table(LOG_HEADS, map(log_cells, doc["logs"])), "",
+    ]  # fmt: skip
+    for name, result in doc["protocols"].items():
+        counted = {log: entry["values"] for log, entry in result["logs"].items() if "left_out" not in entry}
+        lines += [f"## {heading_of(doc, name)}", "", *(f"* {note}" for note in notes_of(doc, name)), ""]
+        if counted:
+            lines += [*rendered(table_of(doc, name, result["pooled"])), ""]
+        for log, values in counted.items():
+            places = dict.fromkeys(place for of in values.values() for place in of["places"])
+            for place in places if len(places) > 1 else ():
+                table = table_of(doc, name, {method: of["places"][place] for method, of in values.items()})
+                lines += [f"### {name}, {log}, {place}", "", *rendered(table), ""]
+    return "\n".join(lines)
+
+
+LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "sweeps", "tracked boxes")
+
+
+def log_cells(log: Mapping[str, Any]) -> list[str]:
+    """A log's row under ``LOG_HEADS``."""
+    cameras = log["cameras"]
+    sizes = dict.fromkeys(f"{of['size_px'][0]}x{of['size_px'][1]}" for of in cameras.values())
+    frames = dict.fromkeys(str(of["frames"]) for of in cameras.values())
+    names = [", ".join(words) for words in (cameras, frames, sizes)]
+    return [log["log"], log["dataset"], *names, str(log["sweeps"]), str(log["tracks"])]
+
+
+def page_of(doc: Mapping[str, Any], out: Path) -> str:
+    """The whole page, which holds its pictures: the truth beside every method for some views of each protocol.
+
+    Args:
+        out: folder of the benchmark, with the pictures.
+    """
+    logs = TextTable.of_texts(LOG_HEADS, map(log_cells, doc["logs"]))
+    sections = [{"title": "Logs", "tables": [logs]}, *(_section(doc, name, out) for name in doc["protocols"])]
+    return pages.render("Real logs", "mudg bench real", summary_of(doc), sections)
+
+
+def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
+    result, walls = doc["protocols"][name], []
+    counted = {log: entry for log, entry in result["logs"].items() if "left_out" not in entry}
+    for log, entry in counted.items():
+        folders = {"truth": out / log / "truth" / name, **{m: out / log / "score" / name / m for m in entry["values"]}}
+        views = store.read_json(folders["truth"] / "targets.json")["views"]
+        for number in entry["pictures"]:
+            view = views[number]
+            shift = f", {view['shift_m']:+g} m" if view["shift_m"] else ""
+            pictures = {title: folder / "pictures" / f"{number:06d}.jpg" for title, folder in folders.items()}
+            walls.append(pages.wall(f"{log}: {view['frame']}{shift}", pictures))
+    below = next((text for key, text in BELOW.items() if key in result["row"]["maps"]), BELOW[""])
+    brackets = f"In brackets: difference to {BASE}, or the ratio (x) where lower is better."
+    return {
+        "title": heading_of(doc, name), "notes": notes_of(doc, name), "walls": walls,
+        "tables": [table_of(doc, name, result["pooled"])] if counted else [], "below": [brackets] * bool(counted) + [below] * bool(walls),
+    }  # fmt: skip
+
+
+BELOW: Final = {
+    "seen": "Below: of the truth the part that the shown cameras saw; of the methods the colour error.",
+    "photo": "Below: of the truth the depth of LiDAR points; of the methods the colour error.",
+    "classes": "Truth: the classes of LiDAR points.",
+    "": "Truth: LiDAR points in their recorded colours, below in the colours of their depth; of the methods colour and depth.",
+}
+"""Map of a protocol -> what the lower pictures show."""

@@ -1,0 +1,289 @@
+"""The rows of benchmarks of complete methods: which methods are compared, with what settings of their fits."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Literal
+
+from mudg.base import config as configuration
+from mudg.base.errors import InputError, UsageError
+from mudg.base.plain_yaml import parse_yaml
+from mudg.benchmarks.papers import PaperTable
+from mudg.methods import METHODS, PUBLISHED
+from mudg.models.mdm import files as mdm_files
+from mudg.models.published.files import is_published
+from mudg.pages.score_tables import title_of
+from mudg.stages import score
+from mudg.stages.config import BenchConfig, FitConfig, PresetName, SynthesizeConfig, bench_preset
+from mudg.stages.fitting.recipes import recipe_of
+from mudg.stages.learning import loading
+from mudg.stages.run import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
+
+FILL, BASE, DIFFUSION, FULL = score.BASELINE, WITHOUT_DIFFUSION, "mudg_r", "mudg_s"
+LONGER: Final = f"{BASE}-longer"
+"""The control of ``mudg_s``: goes on with the first fit for as many iterations, without generated views."""
+LONGER_TITLE: Final = title_of(BASE) + ", as many iterations"
+REPAIRED: Final = "difix"
+EXACT: Final = "exact"
+_NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
+_NO_CLASSES: Final = {"semantic_weight": 0.0}
+ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
+    "only_I": ("virtual colour", {**_NO_DEPTH, **_NO_CLASSES}),
+    "only_I_D": ("virtual colour and depth", _NO_CLASSES),
+    "only_I_S": ("virtual colour and classes", _NO_DEPTH),
+    EXACT: ("the truth in place of generated views", {}),
+}
+"""Rows beside the fit without virtual views and that with all terms, as in table 3 of the paper, and the most that virtual views can bring
+at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
+Sees = Literal["", "adapted", "renders", "points"]
+"""How a method uses its diffusion model: adapted to the log, with renders of the first fit, or with points and photographs alone."""
+LESS: Final[dict[Sees, tuple[str, str]]] = {
+    "adapted": ("", ""), "renders": ("-no-adapt", ", model not adapted"), "points": ("-no-renders", ", points alone"),
+}  # fmt: skip
+"""What a method sees -> the endings of its name and title."""
+PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
+"""Settings of generated views that are the benchmark's matter, not the user's."""
+SAMPLING: Final = (
+    "steps", "sampler", "eta", "overlap", "align_depth", "full_size", "guidance", "guidance_rescale", "memory_budget_gb", "offload",
+    "compiled",
+)  # fmt: skip
+"""Settings of generated views that published-type and small models do not share."""
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row that is computed.
+
+    Args:
+        name: in tables and folders. title: for people. method: of `METHODS`; empty = fused points, holes filled.
+        fit: settings of its fit (those of the first fit where it is ``LONGER``); None = no fit.
+        changes: other settings of its fit or of synthesize; ``model: ""`` = there is no model, so the row has no numbers.
+        sees: how it uses the diffusion model, where benchmarks let it choose. varied: its settings stand in the table.
+    """
+
+    name: str
+    title: str
+    method: str = ""
+    fit: FitConfig | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    sees: Sees = ""
+    varied: bool = False
+
+    @property
+    def left_out(self) -> bool:
+        """Whether it has no model, and so no numbers."""
+        return self.changes.get("model") == ""
+
+    @property
+    def learns_virtual(self) -> bool:
+        """Whether its fit uses generated views."""
+        return self.fit is not None and "virtual" in METHODS[self.fit.method].supervision
+
+
+# ---- settings ----
+
+
+def generator_of(config: BenchConfig) -> SynthesizeConfig:
+    """How views are generated, by the benchmark's model, number format, seed and device; one trajectory at a time."""
+    return replace(
+        config.synthesize, model=config.model, precision=config.precision, seed=config.seed, device=config.device, processes=1
+    )
+
+
+def usual_fit(config: BenchConfig) -> FitConfig:
+    """The settings of fits, as ``mudg run`` takes them for the whole chain."""
+    return replace(config.fit, method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
+
+
+def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
+    """The usual settings with a method. What a preset sets and a method for comparison does not know has its default there.
+
+    Raises:
+        UsageError: a setting beyond the preset that the method does not know.
+    """
+    recipe, named, plain = recipe_of(method), bench_preset(preset).fit, FitConfig()
+    settings = configuration.load(FitConfig, usual, overrides={"method": method})
+    for name in (*recipe.unfit, *(f"loss.{weight}" for weight in recipe.own_weights)):
+        group, _, setting = name.partition(".")
+        own, set_by_preset = getattr(settings, group), getattr(getattr(named, group), setting)
+        if getattr(own, setting) == set_by_preset:
+            settings = replace(settings, **{group: replace(own, **{setting: getattr(getattr(plain, group), setting)})})
+    recipe.check(settings, False)
+    return settings
+
+
+def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
+    """What the chain of a benchmark runs with, for ``bench.json``; ``continued_share`` is None where fits under virtual views begin from
+    nothing."""
+    generator = configuration.result_settings(generator_of(config))
+    return {
+        "preset": preset, "continued_share": CONTINUED_SHARE if config.continue_fit else None,
+        "fuse": configuration.result_settings(config.fuse), "fit": configuration.result_settings(usual_fit(config)),
+        "synthesize": {name: value for name, value in generator.items() if name not in PLACES},
+    }  # fmt: skip
+
+
+def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:
+    """Dotted names of the settings in which a configuration differs from another."""
+    lines = configuration.differences(configuration.to_dict(usual), configuration.to_dict(config))
+    return [line.partition(":")[0] for line in lines]
+
+
+def flag_of(name: str) -> str:
+    """The flag of a setting."""
+    return f"--{name.replace('_', '-')}"
+
+
+def refuse_unfit(config: BenchConfig, preset: PresetName, rows: Sequence[Row], generators: Sequence[SynthesizeConfig]) -> None:
+    """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use.
+
+    Args:
+        preset: what the configuration started from. generators: settings behind all views that are generated for a row itself.
+
+    Raises:
+        UsageError: a setting that no row uses, weights that are asked for and not given, or a method that the model cannot serve.
+        InputError: there is no such model.
+    """
+    fits = [row.fit for row in rows if row.fit is not None]
+    virtual = [fit for fit in fits if {"virtual", "repaired"} & set(METHODS[fit.method].supervision)]
+    renders = mdm_files.uses_renders(config.model)
+    if any(fit.method == REPAIRED for fit in fits) and not renders:
+        raise UsageError(f"{REPAIRED} repairs renders, and this diffusion model uses none", where="--methods", got=config.model,
+                         remedy=f"leave {REPAIRED} out, or choose another --model")  # fmt: skip
+    if fits and not config.continue_fit and LONGER in config.methods:
+        raise UsageError(f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}", where="--methods",
+                         got=LONGER, remedy="leave it out")  # fmt: skip
+    idle = {
+        "no row of this table generates views": () if generators or virtual else ("synthesize",),
+        "no row of this table fits a scene": () if fits or (renders and generators) else ("fit", "iterations", "continue_fit"),
+        "no row of this table learns from virtual views": () if virtual else ("fit.virtual", "continue_fit"),
+    }
+    for name in changed_settings(config, bench_preset(preset)):
+        for reason, unused in idle.items():
+            if any(name == one or name.startswith(f"{one}.") for one in unused):
+                raise UsageError("this setting would change nothing", where=flag_of(name), got=reason, remedy="leave it out")
+    if generators or virtual:
+        refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
+    for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
+        loading.check_config(generator, fitted=False)
+
+
+# ---- rows ----
+
+
+def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
+    """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables.
+
+    Raises:
+        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant.
+    """
+    known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
+    wanted, usual = {*config.methods, *((BASE, FULL) if config.ablation else ())}, usual_fit(config)
+    _refuse_unknown(wanted, known)
+    rows = [_method_row(name, usual, preset) for name in known if name in wanted]
+    for name, (description, weights) in ABLATION.items() if config.ablation else ():
+        rows.append(Row(name, f"with {description}", FULL, configuration.load(FitConfig, usual, overrides={"virtual": weights})))
+    return _without_twins([*rows, *(variant_of(text, usual) for text in config.variant)])
+
+
+def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
+    """The methods and variants of ``mudg bench real``; ``mudg_r`` and ``mudg_s`` are the chain of ``mudg run`` for recorded logs, the rows
+    after each leave out parts of it. Raises as `shift_rows`."""
+    usual = usual_fit(config)
+    less = {name + ending: (name, sees, words) for name in (DIFFUSION, FULL) for sees, (ending, words) in LESS.items()}
+    known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, *less)
+    wanted = {*config.methods, *((BASE, LONGER, *less) if config.ablation else ())}
+    _refuse_unknown(wanted, known)
+    if not config.continue_fit and LONGER not in config.methods:
+        wanted -= {LONGER}
+    rows = []
+    for name in known:
+        whole, sees, words = less.get(name, (name, "", ""))
+        if name in wanted:
+            row = _method_row(whole, usual, preset)
+            rows.append(replace(row, name=name, title=row.title + words, sees=sees))
+    for text in config.variant:
+        row = variant_of(text, usual)
+        rows.append(replace(row, title=title_of(row.name), sees="adapted" if row.learns_virtual else ""))
+    return _without_twins(rows)
+
+
+def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
+    """The rows of a paper's table: its own where it has such, else the methods asked for (all of them, where none is named).
+
+    Raises:
+        UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table that has rows of its own.
+    """
+    usual_methods, freevs = BenchConfig().methods, config.freevs_model
+    if table.rows:
+        if config.methods != usual_methods:
+            raise UsageError("this table has rows of its own", where="--methods", expected="not given", got=", ".join(config.methods))
+        if freevs:
+            raise UsageError("this table has no row freevs", where="--freevs-model", got=f"--table {table.name}", remedy="leave it out")
+        rows = [Row(row.name, row.title, row.method, changes=row.changes) for row in table.rows]
+    else:
+        known = [name for method in METHODS for name in ((method, LONGER) if method == BASE else (method,))]
+        methods = [name for name in config.methods if name != FILL]
+        if config.methods == usual_methods:
+            methods = [name for name in known if config.continue_fit or name != LONGER]
+        _refuse_unknown(methods, known, some=False)
+        if freevs and "freevs" not in methods:
+            raise UsageError("no row freevs was asked for", where="--freevs-model", got=f"--methods {' '.join(config.methods)}",
+                             remedy="leave it out, or add freevs to --methods")  # fmt: skip
+        changes: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": freevs}}
+        if freevs and is_published(config.model):  # the row's own model is a small one, which samples in its own way
+            changes["freevs"] |= {name: getattr(SynthesizeConfig(), name) for name in SAMPLING}
+        if not mdm_files.uses_renders(config.model):
+            changes[REPAIRED] = {"model": ""}
+        control = Row(LONGER, f"{LONGER_TITLE} ({LONGER})", BASE)
+        rows = [
+            control if name == LONGER else Row(name, f"{METHODS[name].title} ({name})", name, changes=changes.get(name, {}))
+            for name in methods
+        ]
+    complete = []
+    for row in rows:
+        if METHODS[row.method].made_by == "render" and not row.left_out:
+            fit = method_fit(usual_fit(config), row.method, preset)
+            row = replace(row, fit=configuration.load(FitConfig, fit, overrides=dict(row.changes)))
+        complete.append(row)
+    return tuple(complete)
+
+
+def _method_row(name: str, usual: FitConfig, preset: PresetName) -> Row:
+    if name in (FILL, DIFFUSION):
+        return Row(name, title_of(name), "" if name == FILL else name)
+    method = BASE if name == LONGER else name
+    return Row(name, LONGER_TITLE if name == LONGER else title_of(name), method, method_fit(usual, method, preset))
+
+
+def variant_of(text: str, usual: FitConfig) -> Row:
+    """A row of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field. UsageError if
+    malformed or no field of ``FitConfig``."""
+    name, separator, rest = text.partition("=")
+    fields: dict[str, Any] = {}
+    for part in rest.split(","):
+        setting, colon, value = part.partition(":")
+        if not (separator and colon and setting and _NAME.fullmatch(name)):
+            raise UsageError("malformed variant", where="--variant", expected="NAME=FIELD:VALUE,FIELD:VALUE", got=text)
+        try:
+            fields[setting.strip()] = parse_yaml(value, setting)
+        except InputError as error:
+            raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
+    changed = configuration.load(FitConfig, usual, overrides=configuration.nested(fields))
+    return Row(name, f"{name}: {rest}", FULL, changed, varied=True)
+
+
+def _refuse_unknown(names: Iterable[str], known: Sequence[str], some: bool = True) -> None:
+    unknown = sorted(set(names) - set(known))
+    if unknown or (some and not names):
+        raise UsageError("unknown method", where="--methods", expected=", ".join(known), got=", ".join(unknown))
+
+
+def _without_twins(rows: Sequence[Row]) -> tuple[Row, ...]:
+    names = [row.name for row in rows]
+    if len(set(names)) < len(names):
+        raise UsageError("two rows have the same name", where="--variant", got=", ".join(names))
+    return tuple(rows)

@@ -1,0 +1,367 @@
+"""``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
+
+Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the ordinary verbs, so that
+whatever is finished is reused and another variant costs only itself. Fits under virtual views go on with the one on recorded views, as in
+``mudg run``.
+
+    OUT/<log>/...   see ``benchmarks/views.py``; generated views lie in OUT/<log>/synthesize
+    OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from mudg.base import config as configuration
+from mudg.base.run_folder import refuse_overlap
+from mudg.benchmarks import page as pages
+from mudg.benchmarks.loop import compare, refuse_foreign, seconds_of
+from mudg.benchmarks.papers import RECORDED, PaperPlace, PaperTable
+from mudg.benchmarks.places import listed_cities
+from mudg.benchmarks.rows import (
+    BASE,
+    DIFFUSION,
+    EXACT,
+    FILL,
+    FULL,
+    chain_settings,
+    generator_of,
+    refuse_unfit,
+    shift_rows,
+)
+from mudg.benchmarks.views import Views, score_settings
+from mudg.data.city import logs as city_logs
+from mudg.data.city.logs import STANDARD, LogRules
+from mudg.models.mdm import files as mdm_files
+from mudg.pages.tables import TextTable, markdown_table
+from mudg.stages.config import BenchConfig, PresetName
+
+SHIFTED: Final = "shifted"
+"""The mean over the lateral distances."""
+COLUMNS: Final[dict[str, tuple[str, int]]] = {
+    "psnr": ("PSNR dB", 2), "ssim": ("SSIM", 3), "perceptual": ("perceptual", 4), "abs_rel": ("AbsRel", 4), "rmse_m": ("RMSE m", 2),
+    "delta1": ("delta1", 4), "miou": ("mIoU", 3), "flicker": ("flicker", 3), "psnr_movers": ("PSNR of dynamic objects", 2),
+}  # fmt: skip
+"""Metric -> heading, digits."""
+RATIOS: Final = ("perceptual", "abs_rel", "rmse_m", "flicker")
+"""Metrics whose comparison is a ratio (a / b); of the others it is a difference (a - b)."""
+COMPARISONS: Final = (
+    (FULL, BASE, SHIFTED, "psnr ssim perceptual abs_rel rmse_m delta1 miou flicker psnr_movers"),
+    (FULL, DIFFUSION, SHIFTED, "psnr perceptual abs_rel miou flicker"),
+    (FULL, BASE, RECORDED, "psnr ssim perceptual abs_rel miou"),
+    (BASE, "gs3d", RECORDED, "psnr psnr_movers"),
+    (BASE, "gs3d", SHIFTED, "psnr psnr_movers"),
+    (FULL, FILL, SHIFTED, "psnr perceptual abs_rel miou"),
+    (DIFFUSION, FILL, SHIFTED, "psnr perceptual abs_rel miou"),
+)
+"""A method, that against which it is held, a place, and metrics."""
+ABLATION_ROWS: Final = {
+    BASE: "none", "only_I": "+ I", "only_I_D": "+ I + D", "only_I_S": "+ I + S", FULL: "+ I + D + S", EXACT: "exact views",
+}  # fmt: skip
+SHOWN: Final = (FILL, "gs3d", BASE, DIFFUSION, FULL)
+"""Methods in the videos."""
+_PAGES: Final = ("bench.json", "bench.md", "page.html")
+
+
+@dataclass(frozen=True)
+class ShiftLog(Views):
+    """One log of the list."""
+
+    @property
+    def title(self) -> str:
+        """For the progress bar."""
+        return self.log.name
+
+    def measure(self) -> dict[str, Any]:
+        """Facts of the log, scores of each method by distance, and seconds of each step."""
+        views, values = self.of_rows(), {}
+        for name, folders in views.items():
+            (metrics,) = self.scores(name, folders).values()
+            values[name] = {f"{entry['distance_m']:g}": entry["values"] for entry in metrics["by_distance"]}
+        films = []
+        if self.config.videos:
+            films = self.film({"truth": self.truth, **{name: of[0] for name, of in views.items() if name in SHOWN}})
+        facts = city_logs.facts(self.log.seed, self.log.rules)
+        return {
+            "log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
+            "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": values,
+            "seconds": seconds_of(self.out),
+        }  # fmt: skip
+
+
+def run(
+    config: BenchConfig, out: Path, *, preset: PresetName = "default", overwrite: bool = False, rules: LogRules = STANDARD,
+    distances_m: Sequence[float] = (2.0, 3.0, 4.0),
+) -> Path:  # fmt: skip
+    """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
+
+    Args:
+        config: see ``BenchConfig``; fields marked shift, and model, precision and seed. preset: what it started from.
+        out: what lies there of the same settings is reused; other methods and variants may be added later.
+        overwrite: replace what other settings left there.
+        rules: frames, size and cameras of the logs. distances_m: lateral distances, each to both sides.
+
+    Raises:
+        UsageError: an unknown method, a malformed variant, a setting that no row uses, or ``out`` holds logs of other settings. Whatever
+            a verb raises.
+    """
+    rows, out = shift_rows(config, preset), Path(out)
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
+    refuse_foreign(
+        out, _PAGES, lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc, lambda entry: entry.name.isdigit()
+    )
+    shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
+    places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
+    table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
+    jobs = [
+        ShiftLog(log, out / log.name, table, rows, config, score_settings(config, table), renders, overwrite, "synthesize", on_path=False)
+        for log in listed_cities(config.list, config.logs, rules)
+    ]
+    refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
+    settings = {
+        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
+        "renders": renders, "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
+        "held_out_every": table.held_out_every, "ablation": config.ablation, **chain_settings(config, preset),
+    }  # fmt: skip
+    values = [
+        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.result_settings(r.fit)} for r in rows
+    ]
+    filled = lambda logs: document(logs, values, list(distances_m), settings)  # noqa: E731
+    return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": page})
+
+
+# ---- numbers ----
+
+
+def document(
+    logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], distances_m: Sequence[float], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Everything ``bench.json`` holds.
+
+    Args:
+        logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
+        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the bench.
+    """
+    shifted = [f"{d:g}" for d in sorted(distances_m)]
+    full = [{**entry, "values": {m: with_mean(of, shifted) for m, of in entry["values"].items()}} for entry in logs]
+    names = [row["name"] for row in rows]
+    pooled = {
+        name: {p: {m: _pooled([entry["values"][name].get(p, {}).get(m, "not produced") for entry in full]) for m in COLUMNS}
+               for p in (RECORDED, *shifted, SHIFTED)}
+        for name in names
+    }  # fmt: skip
+    against_full = [r["name"] for r in rows if FULL in names and r["fit"] is not None and r["name"] not in ("gs3d", BASE, FULL)]
+    return {
+        "schema": 1, "settings": dict(settings), "distances_m": list(distances_m), "methods": [dict(r) for r in rows],
+        "metrics": list(COLUMNS), "logs": full, "pooled": pooled,
+        "comparisons": [c for a, b, place, metrics in COMPARISONS if {a, b} <= {*names} for c in against(full, a, b, place, metrics)],
+        "variants": [
+            {"name": name, "against_mudg_s": [
+                c for place in (SHIFTED, RECORDED) for c in against(full, name, FULL, place, "psnr perceptual abs_rel miou")
+            ]}
+            for name in against_full
+        ],
+    }  # fmt: skip
+
+
+def with_mean(of: Mapping[str, Mapping[str, Any]], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The values of one method and log by distance, with the mean over the distances off the recorded path."""
+    mean: dict[str, Any] = {}
+    for metric in COLUMNS:
+        values = [of.get(place, {}).get(metric, "not produced") for place in shifted]
+        reasons = [value for value in values if isinstance(value, str)]
+        mean[metric] = reasons[0] if reasons else sum(values) / len(values) if values else "not produced"
+    return {**{place: dict(values) for place, values in of.items()}, SHIFTED: mean}
+
+
+def _pooled(values: Sequence[Any]) -> Any:
+    """The mean over the logs that have a number, or the reason of the first log."""
+    numbers = [float(value) for value in values if not isinstance(value, str)]
+    if not numbers:
+        return str(values[0])
+    return {"mean": _mean(numbers), "standard_error": standard_error(_mean, numbers), "logs": len(numbers)}
+
+
+def against(logs: Sequence[Mapping[str, Any]], a: str, b: str, place: str, metrics: str) -> list[dict[str, Any]]:
+    """Comparisons of two methods over the logs that have both numbers, one per metric.
+
+    The difference of the means over logs, or their ratio; the standard error is the jackknife's over logs (for a difference:
+    the spread of the differences of single logs over the root of their number). None with fewer than two logs.
+    """
+    comparisons = []
+    for metric in metrics.split():
+        pairs = [tuple(entry["values"].get(m, {}).get(place, {}).get(metric, "") for m in (a, b)) for entry in logs]
+        known = [None if any(isinstance(value, str) for value in pair) else tuple(map(float, pair)) for pair in pairs]
+        both, of = [pair for pair in known if pair is not None], _ratio if metric in RATIOS else _difference
+        per_log = [None if pair is None else of([pair]) for pair in known]
+        where = "recorded path" if place == RECORDED else "off the recorded path"
+        comparisons.append({
+            "title": f"{a} against {b}, {where}: {COLUMNS[metric][0]}", "a": a, "b": b, "place": place, "metric": metric,
+            "kind": "ratio" if metric in RATIOS else "difference", "value": of(both) if both else None,
+            "standard_error": standard_error(of, both), "logs": len(both),
+            "per_log": [None if value is None else round(value, 5) for value in per_log],
+        })  # fmt: skip
+    return comparisons
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _difference(pairs: Sequence[tuple[float, float]]) -> float:
+    return _mean([a for a, _ in pairs]) - _mean([b for _, b in pairs])
+
+
+def _ratio(pairs: Sequence[tuple[float, float]]) -> float | None:
+    below = _mean([b for _, b in pairs])
+    return _mean([a for a, _ in pairs]) / below if below else None
+
+
+def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[Any]) -> float | None:
+    """Standard error of a statistic of independent items by leaving out each in turn; None for fewer than two items."""
+    count = len(items)
+    values = [of([*items[:i], *items[i + 1 :]]) for i in range(count)] if count > 1 else [None]
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    center = _mean(known)
+    return math.sqrt((count - 1) / count * sum((value - center) ** 2 for value in known))
+
+
+# ---- text ----
+
+
+def virtual_fits_of(settings: Mapping[str, Any]) -> str:
+    """How many iterations fits under virtual views have, as part of a sentence."""
+    share = settings["continued_share"]
+    more = "under virtual views {:g} times as many more after the fit on recorded views"
+    return more.format(share) if share else "those under virtual views too, from nothing"
+
+
+def _summary(settings: Mapping[str, Any]) -> str:
+    seen = " with renders of the fit on recorded views" if settings["renders"] else " without renders"
+    return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; generated{seen}"
+
+
+def markdown(doc: Mapping[str, Any]) -> str:
+    """The tables for people."""
+    settings = doc["settings"]
+    width, height = settings["size_px"]
+    lines = [
+        f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list", "",
+        f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
+        f"frame held out; {_summary(settings)}; seed {settings['seed']}. Means over both "
+        "sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped "
+        "codec, not LPIPS.", "",
+        *markdown_table(FACTS, map(_facts, doc["logs"])), "",
+    ]  # fmt: skip
+    headings = [heading for heading, _ in COLUMNS.values()]
+    names = [row["name"] for row in doc["methods"]]
+    for place in _places(doc):
+        rows = [[name, *_cells(doc["pooled"][name][place])] for name in names]
+        lines += [f"## {_place_title(doc, place)}", "", *markdown_table(["method", *headings], rows), ""]
+    lines += ["## Comparisons", "", *_comparison_table(doc["comparisons"]), ""]
+    if "only_I" in names:
+        metrics = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
+        heads = ["virtual terms", *(COLUMNS[metric][0] for metric in metrics)]
+        rows = [[title, *_cells(doc["pooled"][name][SHIFTED], metrics, with_error=True)] for name, title in ABLATION_ROWS.items()]
+        lines += ["## Which virtual term does what", "", *markdown_table(heads, rows), ""]
+    for variant in doc["variants"]:
+        lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
+    rows = [[str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in doc["logs"] for name in names]
+    steps = dict.fromkeys(step for entry in doc["logs"] for step in entry["seconds"])
+    seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in doc["logs"])] for step in steps]
+    lines += ["## Each log, mean off the recorded path", "", *markdown_table(["log", "method", *headings], rows), ""]
+    lines += ["## Seconds per log", "", *markdown_table(["step", *(str(entry["log"]) for entry in doc["logs"])], seconds), ""]
+    return "\n".join(lines)
+
+
+def page(doc: Mapping[str, Any]) -> str:
+    """The whole page from what ``bench.json`` holds."""
+    settings, names = doc["settings"], [row["name"] for row in doc["methods"]]
+    *places, mean = _places(doc)
+    heads = ["method", *(heading for heading, _ in COLUMNS.values())]
+    compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
+    scores = [
+        TextTable.of_texts(
+            heads, [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names], _place_title(doc, place)
+        )
+        for place in (mean, *places)
+    ]
+    videos = pages.films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
+    return pages.render(
+        f"Off the recorded path: {_logs_text(doc)}, {settings['list']} list", "mudg bench shift",
+        f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {_summary(settings)}. Means over logs and "
+        "both sides of the path.",
+        [
+            *([videos] if videos["films"] else []),
+            {"title": "Comparisons", "tables": [TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)]},
+            {"title": "Scores", "tables": scores},
+            {"title": "Logs", "tables": [TextTable.of_texts(FACTS, map(_facts, doc["logs"]))]},
+        ],
+        "The videos lie beside this page.",
+    )  # fmt: skip
+
+
+def _places(doc: Mapping[str, Any]) -> list[str]:
+    """The recorded path, the distances from it, and their mean."""
+    return [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]
+
+
+def _logs_text(doc: Mapping[str, Any]) -> str:
+    count = len(doc["logs"])
+    return f"{count} log{'s' if count != 1 else ''}"
+
+
+def _place_title(doc: Mapping[str, Any], place: str) -> str:
+    if place == RECORDED:
+        return "Recorded path, held-out frames"
+    if place == SHIFTED:
+        return "Mean over " + ", ".join(f"{d:g}" for d in sorted(doc["distances_m"])) + " m"
+    return f"{place} m to either side"
+
+
+def _cells(values: Mapping[str, Any], metrics: Sequence[str] = tuple(COLUMNS), with_error: bool = False) -> list[str]:
+    """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the reason for none."""
+    cells = []
+    for metric in metrics:
+        value, digits = values[metric], COLUMNS[metric][1]
+        if isinstance(value, Mapping):
+            error = value["standard_error"]
+            more = f" +- {error:.{digits}f}" if with_error and error is not None else ""
+            cells.append(f"{value['mean']:.{digits}f}{more}")
+        else:
+            cells.append(value if isinstance(value, str) else f"{value:.{digits}f}")
+    return cells
+
+
+FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
+
+
+def _facts(entry: Mapping[str, Any]) -> list[str]:
+    """Cells of a log's row under ``FACTS``."""
+    return [
+        str(entry["log"]), f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"]),
+        f"{entry['mover_share']:.1%}", entry["words"],
+    ]  # fmt: skip
+
+
+def _compared(comparison: Mapping[str, Any]) -> tuple[str, str]:
+    """A comparison's value and standard error as text."""
+    is_difference, error = comparison["kind"] == "difference", comparison["standard_error"]
+    digits, sign = (COLUMNS[comparison["metric"]][1], "+") if is_difference else (3, "")
+    if comparison["value"] is None:
+        return "no number", ""
+    return f"{comparison['value']:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"
+
+
+def _comparison_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    cells = []
+    for row in rows:
+        each = " ".join("-" if v is None else f"{v:.3g}" for v in row["per_log"])
+        cells.append([row["title"], *_compared(row), row["kind"], str(row["logs"]), each])
+    return markdown_table(["", "value", "standard error", "as", "logs", "each log"], cells)

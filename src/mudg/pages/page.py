@@ -1,0 +1,375 @@
+"""The report page: what ``templates/report.html.j2`` shows, worked out from plain values. No torch, no files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mudg.base import memory
+from mudg.core.pictures import depth_colors
+from mudg.pages import html
+from mudg.pages.commands import next_commands, step_commands
+from mudg.pages.score_tables import (
+    FLOOR,
+    NOT_COMPUTED,
+    SET_METRICS,
+    WEIGHT_FLAGS,
+    best_of,
+    distance_title,
+    floors_by_distance,
+    number_text,
+    title_of,
+    values_by_distance,
+)
+
+GROUPS: Final = (
+    ("Colour", ("psnr", "ssim", "perceptual")),
+    ("Motion", ("psnr_movers", "flicker")),
+    ("Depth", ("abs_rel", "rmse_m", "delta1")),
+    ("Classes", ("miou", "accuracy")),
+    ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
+    ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
+    ("Steadiness", ("warp_error", "temporal_flickering", "subject_consistency", "clip_f")),
+)
+OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
+"""Groups that are left out, and distances of them, where no method has a number."""
+ABSENT: Final = ("lpips", "fid", "kid", "fvd")
+"""Metrics whose columns are shown although they were not computed; the others are named below the tables."""
+CHARTED: Final = ("psnr", "abs_rel", "miou")
+NEAR_M: Final = 2.0
+FAR_M: Final = 80.0
+WITH: Final = "mudg_s"
+WITHOUT: Final = "street_gaussians"
+FPS: Final = 10
+PANEL_ROWS: Final = (("rgb", "Colour"), ("depth", "Depth"), ("semantics", "Classes"), ("error", "Colour error"))
+"""Rows of a video, and their titles."""
+
+
+@dataclass(frozen=True)
+class TrajectoryVideo:
+    """The video of one trajectory.
+
+    Args:
+        name, camera, shift_m: as in the scores. width, height: of one panel, pixels. frames: number of pictures.
+        panels: column name -> rows it has. video, poster: data URIs (video may be empty: no encoder).
+    """
+
+    name: str
+    camera: str
+    shift_m: float | None
+    width: int
+    height: int
+    frames: int
+    panels: Mapping[str, Sequence[str]]
+    video: str
+    poster: str
+
+    @property
+    def place(self) -> str:
+        """Where the trajectory runs, for people."""
+        return shift_title(self.shift_m, self.name)
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """How the diffusion model was adapted: the content of ``adapt.json``, and pictures (title, data URI)."""
+
+    record: Mapping[str, Any]
+    pictures: Sequence[tuple[str, str]]
+
+
+def page(
+    scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str, videos: Sequence[TrajectoryVideo],
+    columns: Sequence[str], adaptation: Adaptation | None = None, viewer: str = "", out: Path = Path(),
+) -> str:  # fmt: skip
+    """The text of the page.
+
+    Args:
+        scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
+        columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if there was one.
+        viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for commands.
+    """
+    scene = scores["scene"]
+    heading, lead = headline(scores)
+    source = str(ledger.get("asked", {}).get("source", "LOG"))
+    return html.render(
+        "report.html.j2", title=f"{scene['id']}: mudg report", kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
+        heading=heading, lead=lead, scene=scene, viewer=viewer, facts=_facts(scores, ledger), rules=scores["rules"],
+        methods=scores["methods"], settings=settings, provenance=_provenance(scores, ledger),
+        adaptation=None if adaptation is None else adaptation.record,
+        adaptation_pictures=() if adaptation is None else adaptation.pictures,
+        next_commands=next_commands(out, source), step_commands=step_commands(out, source),
+        **_player_values(scores, videos, columns), **_score_values(scores), **_time_values(ledger),
+    )  # fmt: skip
+
+
+# ---- text at the top ----
+
+
+def headline(scores: Mapping[str, Any]) -> tuple[str, str]:
+    """Headline and one paragraph that say what the numbers say, also when diffusion did not help."""
+    values = values_by_distance(scores)
+    shifted = sorted({d for m, d in values if d > 0 and m == WITH and isinstance(values[m, d].get("psnr"), float)})
+    recorded = [values.get((method, 0.0), {}).get("psnr") for method in (WITH, WITHOUT)]
+    held_out = ""
+    if all(isinstance(value, float) for value in recorded):
+        held_out = f"held-out frames score {recorded[0]:.1f} dB with diffusion and {recorded[1]:.1f} dB without."
+    if not shifted:
+        text = "There is no ground truth off the recorded path: views there are shown below, not scored."
+        return (
+            f"{scores['scene']['id']}: views off the recorded path",
+            f"{text} On the path, {held_out}" if held_out else text,
+        )
+    far = shifted[-1]
+    with_, without = values[WITH, far], values.get((WITHOUT, far), {})
+    if not isinstance(without.get("psnr"), float):
+        return f"{far:g} m off the recorded path", ""
+    gain = with_["psnr"] - without["psnr"]
+    verdict = f"diffusion {'adds' if gain > 0 else 'costs'} {abs(gain):.1f} dB"
+    if abs(gain) < 0.05:
+        verdict = "diffusion makes no difference to colour"
+    sentences = [
+        f"{distance_title(scores, far)} of the recorded path, colour reaches {with_['psnr']:.1f} dB against exact ground truth "
+        f"({without['psnr']:.1f} dB without diffusion)."
+    ]
+    for metric, text in (("abs_rel", "relative depth error"), ("miou", "class overlap (mIoU)")):
+        if isinstance(with_.get(metric), float) and isinstance(without.get(metric), float):
+            sentences.append(f"The {text} is {with_[metric]:.3f}, against {without[metric]:.3f} without.")
+    if held_out:
+        sentences.append(f"On the recorded path itself, {held_out}")
+    return f"{far:g} m off the recorded path, {verdict}", " ".join(sentences)
+
+
+def _facts(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tuple[str, str]]:
+    scene = scores["scene"]
+    cameras = len(scene["cameras"])
+    return [
+        (f"{scene['frames']}", "recorded frames"),
+        (f"{cameras}", "camera" if cameras == 1 else "cameras"),
+        (f"{scene['tracks']}", "tracked objects"),
+        (f"{sum(t['views'] for t in scores['trajectories'])}", "views rendered per method"),
+        (_duration(sum(step["seconds"] for step in ledger.get("steps", {}).values())), "from log to this page"),
+    ]
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+# ---- player ----
+
+
+def shift_title(shift_m: float | None, name: str) -> str:
+    """Where a trajectory runs, for people."""
+    if shift_m is None:
+        return name
+    return "recorded path" if shift_m == 0 else f"{abs(shift_m):g} m {'left' if shift_m > 0 else 'right'}"
+
+
+def _player_values(
+    scores: Mapping[str, Any], videos: Sequence[TrajectoryVideo], columns: Sequence[str]
+) -> dict[str, Any]:
+    """What ``player.html.j2`` shows; ``player`` goes to ``player.js``."""
+    exact = scores["truth"] == "exact"
+    ordered = sorted(videos, key=lambda v: (v.camera, -(v.shift_m if v.shift_m is not None else -1e9)))
+    first = max((v for v in videos if v.shift_m), key=lambda v: v.shift_m or 0.0, default=next(iter(videos), None))
+    steps = np.geomspace(NEAR_M, FAR_M, 8).astype(np.float32)[None]
+    return {
+        "exact": exact,
+        "videos": [{"label": f"{v.camera}, {v.place}", "source": v.video, "poster": v.poster} for v in videos],
+        "cameras": list(dict.fromkeys(v.camera for v in videos)),
+        "shift_choices": [
+            {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first} for v in ordered
+        ],
+        "depth_scale": {
+            "near": f"{NEAR_M:g}", "far": f"{FAR_M:g}",
+            "stops": ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0]),
+        },
+        "class_legend": html.class_legend(),
+        "player": {
+            "fps": FPS, "columns": list(columns), "rows": [{"name": name, "title": title} for name, title in PANEL_ROWS],
+            "titles": {c: title_of(c) if exact or c != "truth" else "Recorded path" for c in columns},
+            "trajectories": [
+                {"index": i, "name": v.name, "camera": v.camera, "title": v.place, "width": v.width, "height": v.height,
+                 "frames": v.frames, "panels": {c: list(p) for c, p in v.panels.items()}}
+                for i, v in enumerate(videos) if v.video
+            ],
+        },
+    }  # fmt: skip
+
+
+# ---- numbers ----
+
+
+def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``scores.html.j2`` shows."""
+    values = values_by_distance(scores)
+    distances = sorted({d for m, d in values if any(isinstance(v, float) for v in values[m, d].values())})
+    metrics = {m["name"]: m for m in scores["metrics"]}
+    absent = [m for m in metrics.values() if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in scores["results"])]
+    main = [n for title, names in GROUPS if title not in OPTIONAL for n in names]
+    sets = [name for name, entry in SET_METRICS.items() if entry in scores]
+    distances = [d for d in distances if _shown(values, [*main, *sets], d)]
+    groups = []
+    for title, names in GROUPS:
+        there = distances
+        if title in OPTIONAL:
+            names = [n for n in names if any(isinstance(of.get(n), float) for of in values.values())]
+            there = [d for d in sorted({d for _, d in values}) if _shown(values, names, d)]
+        if there:
+            groups.append(_score_group(scores, title, [metrics[n] for n in names if n in metrics], there))
+    made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
+    if made_of_sets:
+        groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
+    shown = [m for m in absent if m["name"] in ABSENT]
+    if shown:
+        cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in shown]
+        rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
+        groups.append({"title": "Perceptual", "distances": [], "metrics": shown, "rows": rows})
+    numeric = [
+        m for m in metrics.values() if any(isinstance(r["values"].get(m["name"]), float) for r in scores["results"])
+    ]
+    return {
+        "score_groups": groups if distances or any(group["title"] in OPTIONAL for group in groups) else [],
+        "not_computed": ", ".join(f"{m['title']} ({_remedy_of(m)})" for m in absent),
+        "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
+        "result_metrics": numeric,
+        "results": [
+            [r["trajectory"], title_of(r["method"]), r["views"], *(number_text(m["name"], r["values"].get(m["name"])) for m in numeric)]
+            for t in scores["trajectories"] for r in scores["results"] if r["trajectory"] == t["name"]
+        ],
+    }  # fmt: skip
+
+
+def _shown(values: Mapping[tuple[str, float], Mapping[str, Any]], names: Sequence[str], distance: float) -> bool:
+    """Whether some method has a number in one of these metrics at a distance."""
+    return any(isinstance(of.get(name), float) for (_, d), of in values.items() if d == distance for name in names)
+
+
+def _score_group(
+    scores: Mapping[str, Any], title: str, metrics: Sequence[Mapping[str, Any]], distances: Sequence[float]
+) -> dict[str, Any]:
+    """One table: the metrics of a group at every distance."""
+    values, methods = values_by_distance(scores), [m["name"] for m in scores["methods"]]
+
+    def cells(method: str) -> Iterator[dict[str, str]]:
+        for distance in distances:
+            for number, metric in enumerate(metrics):
+                across = {m: values.get((m, distance), {}).get(metric["name"]) for m in methods}
+                classes = ["edge"] * (number == 0) + ["best"] * (
+                    method in best_of(metric["better"], across, metric["name"])
+                )
+                classes += ["absent"] * isinstance(across[method], str)
+                yield {"text": number_text(metric["name"], across[method]), "classes": " ".join(classes)}
+
+    rows = [{"method": m["name"], "title": m["title"], "cells": list(cells(m["name"]))} for m in scores["methods"]]
+    return {
+        "title": title,
+        "distances": [distance_title(scores, d) for d in distances],
+        "metrics": metrics,
+        "rows": rows,
+    }
+
+
+def _remedy_of(metric: Mapping[str, Any]) -> str:
+    flag = WEIGHT_FLAGS.get(metric["name"])
+    return f"{metric['needs'][-1]}" + (f": mudg score {flag} FILE" if flag else "")
+
+
+def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
+    """The group with a last row: what the truth itself scores."""
+    floors = floors_by_distance(scores)
+    cells = [{"text": number_text(m["name"], floors.get(d, {}).get(m["name"])), "classes": ""} for d in distances for m in group["metrics"]]
+    return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
+
+
+def chart_points(scores: Mapping[str, Any], metric: str) -> dict[str, list[tuple[float, float]]]:
+    """Method -> (shift in metres, mean value over cameras), left of the road first."""
+    shifts = {t["name"]: t["shift_m"] for t in scores["trajectories"] if t["shift_m"] is not None}
+    points: dict[str, list[tuple[float, float]]] = {}
+    for method in scores["methods"]:
+        found: dict[float, list[float]] = {}
+        for r in scores["results"]:
+            value = r["values"].get(metric)
+            if r["method"] == method["name"] and r["trajectory"] in shifts and isinstance(value, float):
+                found.setdefault(float(shifts[r["trajectory"]]), []).append(value)
+        if found:
+            points[method["name"]] = [(s, sum(v) / len(v)) for s, v in sorted(found.items(), reverse=True)]
+    return points
+
+
+def axis_ticks(low: float, high: float) -> list[float]:
+    """Three to six round numbers that enclose all values, at even distances."""
+    span = (high - low) or abs(high) or 1.0
+    power = 10.0 ** math.floor(math.log10(span / 3))
+    step = next(power * k for k in (1, 2, 2.5, 5, 10) if span / (power * k) <= 4)
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [i * step for i in range(first, max(last, first + 2) + 1)]
+
+
+def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Values of the macro ``chart``: one line per method over the lateral shift; None with fewer than two shifts."""
+    points = chart_points(scores, metric["name"])
+    shifts = sorted({s for p in points.values() for s, _ in p})
+    if len(shifts) < 2:
+        return None
+    numbers = [v for p in points.values() for _, v in p]
+    ticks = axis_ticks(min(numbers), max(numbers))
+    left, right, top, bottom = 40.0, 330.0, 8.0, 150.0
+
+    def x(shift: float) -> float:  # left of the road is left on the chart
+        return round(left + (shifts[-1] - shift) / (shifts[-1] - shifts[0]) * (right - left), 1)
+
+    def y(value: float) -> float:
+        return round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
+
+    better = f"{metric['better']} is better"
+    return {
+        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""), "better": better,
+        "label": f"{metric['title']} over the lateral shift, {better}", "left": left, "right": right, "bottom": bottom,
+        "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
+        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts], "to_left": shifts[-1] > 0, "to_right": shifts[0] < 0,
+        "lines": [{"method": m, "points": [(x(s), y(v)) for s, v in line]} for m, line in points.items()],
+    }  # fmt: skip
+
+
+# ---- times, settings ----
+
+
+def _time_values(ledger: Mapping[str, Any]) -> dict[str, Any]:
+    seconds = {name: step["seconds"] for name, step in ledger.get("steps", {}).items()}
+    total, longest = sum(seconds.values()) or 1.0, max(seconds.values(), default=1.0) or 1.0
+    size = lambda step, name: memory.in_words(step[name]) if step.get(name) else ""  # noqa: E731
+    steps = [
+        {"name": name, "seconds": step["seconds"], "processor_s": step.get("processor_s"), "memory": size(step, "peak_bytes"),
+         "written": size(step, "written_bytes"), "share": step["seconds"] / total, "of_longest": step["seconds"] / longest}
+        for name, step in ledger.get("steps", {}).items()
+    ]  # fmt: skip
+    return {"steps": steps, "total_time": _duration(total)}
+
+
+def _provenance(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What was run, on what and by what: rows that have a value."""
+    environment, asked, scene = ledger.get("environment", {}), ledger.get("asked", {}), scores["scene"]
+    sizes = ", ".join(f"{name} {w} x {h}" for name, (w, h) in scene["cameras"].items())
+    seeds = {str(asked[verb]["seed"]) for verb in ("synthesize", "fit") if "seed" in asked.get(verb, {})}
+    machine = [environment.get(key, "") for key in ("system", "machine", "cpu_count")]
+    rows = [
+        ("Input", str(asked.get("source", ""))),
+        ("Scene", f"{scene['id']}: {scene['frames']} frames, {scene['held_out']} held out; cameras {sizes}"),
+        ("Seed", ", ".join(sorted(seeds))),
+        ("Diffusion model", str(asked.get("synthesize", {}).get("model", "")).replace("embedded", "shipped with mudg")),
+        ("Licence of the data", scene["licence"]),
+        ("Ground truth", "exact at any view" if scores["truth"] == "exact" else "recorded held-out frames only"),
+        ("Program", f"mudg {environment.get('mudg', '')}, Python {environment.get('python', '')}"),
+        ("Machine", f"{machine[0]} {machine[1]}, {machine[2]} processors"),
+        ("Packages", ", ".join(f"{name} {version}" for name, version in environment.get("packages", {}).items())),
+        ("Hashes (SHA-256)", ", ".join(f"{name} {digest[:16]}" for name, digest in ledger.get("digests", {}).items())),
+    ]
+    return [(name, value) for name, value in rows if value]
