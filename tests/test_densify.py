@@ -197,11 +197,7 @@ def test_objects_count_with_their_plain_gradient():
     assert stats.gradient.tolist() == pytest.approx([60.0, 40.0, 30.0])
 
 
-def test_files_in_which_densify_was_a_plain_value_are_told_its_new_name(tmp_path):
-    for text in ("true", "mcmc"):
-        (tmp_path / "fit.yaml").write_text(f"densify: {text}\n")
-        with pytest.raises(UsageError, match=r"densify is now called densify\.kind"):
-            configuration.load(FitConfig, None, tmp_path / "fit.yaml")
+def test_a_wrong_kind_of_densification_is_refused(tmp_path):
     (tmp_path / "fit.yaml").write_text("densify: {kind: mcm}\n")
     with pytest.raises(UsageError, match="'gradient', 'mcmc' or 'none'"):
         configuration.load(FitConfig, None, tmp_path / "fit.yaml")

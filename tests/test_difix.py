@@ -67,9 +67,9 @@ def test_repairs_need_a_fit_and_only_they_go_with_one():
 
 
 def test_repaired_views_move_towards_their_places():
-    generator = SynthesizeConfig(shifts_m=(3.0, -3.0, 0.0), paths=("lane+0.1",), steps=4, samples=2)
+    generator = SynthesizeConfig(shifts_m=(3.0, -3.0, 0.0), paths=("lane+0.1",), steps=4)
     first, last = repair_settings(generator, 1 / 3), repair_settings(generator, 1.0)
-    assert (first.shifts_m, first.paths, first.steps, first.samples) == ((1.0, -1.0), (), 1, 1)
+    assert (first.shifts_m, first.paths, first.steps) == ((1.0, -1.0), (), 1)
     assert (last.shifts_m, last.paths, last.condition) == ((3.0, -3.0), ("lane+0.1",), "repair")
     assert repair_settings(replace(generator, shifts_m=(0.0,)), 1 / 3).paths == ("lane+0.1",)
 

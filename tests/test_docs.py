@@ -24,7 +24,10 @@ from mudg import app, native
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
-FLAGS: dict[str, list[str]] = json.loads((REPOSITORY / "tests" / "house" / "cli.json").read_text(encoding="utf-8"))
+FLAGS: dict[str, list[str]] = {
+    verb: [*flags, *(re.sub(r"([^.-]+(?:-[^.]+)*)$", r"no-\1", flag) for flag in flags)]
+    for verb, flags in json.loads((REPOSITORY / "tests" / "house" / "cli.json").read_text(encoding="utf-8")).items()
+}
 
 FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--rdzv-conf": "torchrun", "--standalone": "torchrun",
                  "--version": "mudg", "--dist": "pytest", "--help": "every verb", "--help-all": "mudg run, mudg demo",
@@ -32,12 +35,12 @@ FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--rdzv
                  **dict.fromkeys(("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle",
                                   "--shutdown-timeout"), "torchrun"),
                  **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch")}  # fmt: skip
-FOLDERS = "base core native data models report stages bench docs tests tools build_backend src".split()
+FOLDERS = "base core native data models pages stages steps benchmarks bench docs tests tools build_backend src".split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 
 
 FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
-FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud")
+FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud", "RayCluster", "RayJob")
 
 
 SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")

@@ -203,7 +203,7 @@ def test_the_page_names_no_place_of_this_machine(toy: tuple[Path, Path, SceneMod
 def test_a_page_is_not_replaced_without_being_asked(toy: tuple[Path, Path, SceneModel]) -> None:
     with pytest.raises(UsageError, match="exists"):
         view.run_page(PageConfig(), toy[1], toy[0] / "page.html", scene=toy[0] / "scene")
-    with pytest.raises(UsageError, match="log"):
+    with pytest.raises(UsageError, match="scene of this fit is not known"):
         view.run_page(PageConfig(), toy[1], toy[0] / "other.html")
 
 

@@ -124,7 +124,7 @@ def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConf
     Paths with a name begin at the end of the way."""
     shifts = tuple(round(share * shift, 4) for shift in generator.shifts_m if shift)
     return replace(
-        generator, condition="repair", steps=1, samples=1, shifts_m=shifts, paths=generator.paths if share == 1 or not shifts else (),
+        generator, condition="repair", steps=1, shifts_m=shifts, paths=generator.paths if share == 1 or not shifts else (),
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from mudg.core.raster.place import drawing_device
 from mudg.stages.config import BenchConfig
 
 
-class Job(Protocol):
+class BenchJob(Protocol):
     """What is worked on at a time, in terms that another process understands."""
 
     @property
@@ -29,7 +29,7 @@ class Job(Protocol):
 
 
 def compare(
-    out: Path, jobs: Sequence[Job], config: BenchConfig, document: Callable[[list[dict[str, Any]]], dict[str, Any]],
+    out: Path, jobs: Sequence[BenchJob], config: BenchConfig, document: Callable[[list[dict[str, Any]]], dict[str, Any]],
     texts: Mapping[str, Callable[[Mapping[str, Any]], str]],
 ) -> Path:  # fmt: skip
     """Do all jobs, several at a time with one thread each; write ``bench.json`` and its texts. Results do not depend on how many run at
@@ -51,7 +51,7 @@ def compare(
     return out
 
 
-def _measure(job: Job) -> dict[str, Any]:
+def _measure(job: BenchJob) -> dict[str, Any]:
     return job.measure()
 
 

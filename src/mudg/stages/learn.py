@@ -59,8 +59,6 @@ from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.scene_list import ListedShards, is_list, read_list
 from mudg.stages.learning.state import TrainingState, mean_of
 
-REFINED_SHARE = 0.5
-"""The refiner is trained on a crop whose sides are this share of the image's."""
 _OUTPUT = VerbOutput(
     "learn", 1,
     ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", f"{learn_clips.CACHE}/", "samples/*.png", "tensorboard/",
@@ -331,7 +329,7 @@ def _train_network(
 
 def _loss_settings(config: LearnConfig, class_weights: Tensor) -> LossSettings:
     data = config.data
-    return LossSettings(class_weights, REFINED_SHARE, data.reference_dropout,
+    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout,
                         frame_dropout=data.reference_dropout_scope == "tokens_and_frame")  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from mudg.base import config as configuration
 from mudg.base.errors import UsageError, nearest
-from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, positions, usage
+from mudg.steps.step import Option, Step, flag_name, flag_of, is_many, options, positions, present, usage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +127,9 @@ def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> No
 
 def _value(kind: Any, value: Any) -> Any:
     """The words of a flag as the plain value that its type is checked against."""
+    kind = kind if value == "None" or value == ["None"] else present(kind)
+    if value == ["None"] and type(None) in get_args(kind):
+        return None
     if isinstance(value, list):
         if get_origin(kind) is tuple:
             inner = get_args(kind)[0]
@@ -225,6 +228,7 @@ def _first_sentence(text: str) -> str:
 
 def metavar_of(kind: Any) -> str:
     """What stands for a value of a type."""
+    kind = present(kind)
     if is_many(kind):
         if get_origin(kind) is not tuple:
             return "NAME=FOLDER ..."

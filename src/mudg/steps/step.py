@@ -217,7 +217,14 @@ def positions(cls: type[Any]) -> list[str]:
 
 def is_many(kind: Any) -> bool:
     """Whether a flag takes several words."""
+    kind = present(kind)
     return get_origin(kind) is tuple or (isinstance(get_origin(kind), type) and issubclass(get_origin(kind), Mapping))
+
+
+def present(kind: Any) -> Any:
+    """A type without None."""
+    inside = [one for one in get_args(kind) if one is not type(None)]
+    return inside[0] if type(None) in get_args(kind) and len(inside) == 1 else kind
 
 
 def flag_name(name: str) -> str:

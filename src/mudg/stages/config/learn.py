@@ -20,7 +20,7 @@ class LearnData:
 
     STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "all_cities_at": ("clips_per_city", 0.6), "weathers": ("textures", 0), "effect_dropout": ("textures", 0.1),
+        "weathers": ("textures", 0), "effect_dropout": ("textures", 0.1),
     }  # fmt: skip
     """Settings that may be addresses of an object store."""
     width: int = Field(default=192, ge=32)
@@ -46,6 +46,8 @@ class LearnData:
     """Generated cities to leave out before the first one, for example those of an earlier run whose `clips` this run uses and adds to."""
     first_cities: int = Field(default=40, ge=1)
     """Number of cities in use from the first step. The others are generated and join while training runs."""
+    all_cities_at: float = Field(default=0.6, ge=0, le=1)
+    """Share of the steps after which all cities are in use, 0 to 1."""
     clips_per_city: int = Field(default=4, ge=1)
     """Clips taken from each generated city."""
     realism: Literal["plain", "varied", "mixed"] = "plain"
@@ -162,11 +164,11 @@ class LearnOptimizer:
 class LearnLoss:
     """Terms of the training loss."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"refined_share": ("", 0.5)}
-
     class_balance: float = Field(default=0.0, ge=0, le=1)
     """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The bias this
     gives the refiner's class scores is removed after training."""
+    refined_share: float = Field(default=0.5, gt=0, le=1)
+    """The refiner is trained on a crop whose sides are this share of the image's."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -34,23 +34,19 @@ CACHE = "cache"
 """Where in the output folder clips are kept that are fetched or made when they are needed, while training runs."""
 
 
-ALL_CITIES_AT = 0.6
-"""Share of the steps after which all cities are in use."""
-
-
 def held_out_cities(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
     return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
 
 
 def cities_in_use(config: LearnConfig, step: int) -> range:
-    """Cities that training may draw from at `step`: `first_cities`, then linearly up to `cities` at ALL_CITIES_AT, after those skipped.
+    """Cities that training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`, after those skipped.
 
     A function of the step alone, so that clips can still be in the making while training runs and the draw stays the
     same in every run.
     """
     data = config.data
-    share = min(1.0, step / max(1.0, ALL_CITIES_AT * config.steps))
+    share = min(1.0, step / max(1.0, data.all_cities_at * config.steps))
     count = min(data.cities, data.first_cities + int((data.cities - data.first_cities) * share))
     return range(data.skip_cities, data.skip_cities + count)
 
