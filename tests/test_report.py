@@ -131,7 +131,7 @@ def test_the_report_holds_commands_that_can_be_copied_and_work(
         if line.startswith("mudg "):
             args, _ = app.parse(shlex.split(line)[1:])
             for given in (getattr(args, name, None) for name in ("source", "scene")):
-                assert given is None or Path(given).exists(), line
+                assert given is None or str(given) == "LOG" or Path(given).exists(), line
     assert subprocess.run(next(x for x in lines if x.startswith("printf")), shell=True, check=True).returncode == 0
     script = read_edits(Path("edits.yaml")) if Path("edits.yaml").exists() else None
     assert script is not None and [(e.verb, list(e.settings.ids)) for e in script.edits] == [("remove", ["car 1"])]
