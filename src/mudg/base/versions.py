@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 import os
 import platform
-from importlib import metadata
 from typing import Any
 
 
 def version() -> str:
     """Version of this package, or ``0+unknown`` when it runs uninstalled."""
+    from importlib import metadata  # late: it takes a sixth of what --help takes
+
     try:
         return metadata.version("mudg")
     except metadata.PackageNotFoundError:
@@ -21,6 +22,8 @@ def version() -> str:
 def environment() -> dict[str, Any]:
     """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once: metadata
     is parsed anew at every question."""
+    from importlib import metadata
+
     packages = {}
     for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av"):
         try:

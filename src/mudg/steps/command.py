@@ -167,9 +167,9 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
         lines += ["", "examples:", *(f"  {line}" for line in shown)]
     if cls.parts and not part:
         lines += ["", f"mudg {cls.verb()} WORD --help, for each of: " + ", ".join(cls.parts)]
-    own = [one for one in options(cls) if one.own]
-    base = None if cls.settings_type() is None else cls.settings_from(_defaults(own), None, {})
-    settings = [one for one in options(cls, base) if not one.own]
+    defaults = {field.name: field.default for field in dataclasses.fields(cls) if field.name != "settings"}
+    rows = list(options(cls, None if cls.settings_type() is None else cls.settings_from(defaults, None, {})))
+    own, settings = [one for one in rows if one.own], [one for one in rows if not one.own]
     if part:
         own, settings = ([one for one in rows if cls.applies(part, one.name, one.text)] for rows in (own, settings))
     hidden = 0
@@ -189,10 +189,6 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
             *([f"{hidden} more settings, and longer texts: mudg {cls.verb()} --help-all"] if hidden else []),
         ]
     return "\n".join(lines)
-
-
-def _defaults(own: Sequence[Option]) -> dict[str, Any]:
-    return {option.name: option.default for option in own if option.default is not MISSING}
 
 
 def _row(cls: type[Step], option: Option, whole: bool) -> list[str]:

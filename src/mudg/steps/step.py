@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
+import functools
 import inspect
 import sys
 import typing
@@ -188,6 +189,7 @@ class _Settings(dict[str, Any]):
             raise KeyError(name) from None
 
 
+@functools.cache
 def hints(cls: type[Any]) -> dict[str, Any]:
     """Types of the fields of a step or of settings, with their `Flag` where they have one."""
     return get_type_hints(cls, localns=_Settings(), include_extras=True)
