@@ -93,8 +93,8 @@ edits = root / "edits"; edits.mkdir()
 for name, text in {
     "remove": "- remove: {ids: [car-001]}", "move": "- move: {id: car-001, along_m: -2}",
     "lane": "- lane_change: {id: ego, left_m: 1.5, start_s: 0, duration_s: 2}", "stop": "- stop: {id: car-001, at_s: 0.1}",
-    "speed": "- speed: {id: car-001, factor: 0.5}", "weather": "- weather: {kind: fog, strength: 0.5}\\n",
-    "light": "- light: {time: dusk}\\n", "season": "- season: {leaves: autumn}",
+    "speed": "- speed: {id: car-001, factor: 0.5}", "weather": "- weather: {fog: {visibility_m: 40}}",
+    "light": "- light: {time: dusk}", "season": "- season: {leaves: autumn}",
     "wrong_key": "- remove: {idss: [car-001]}", "wrong_id": "- remove: {ids: [car-999]}",
 }.items():
     (edits / f"{name}.yaml").write_text(text + "\\n")
@@ -127,8 +127,19 @@ def check_out(commit: str, folder: Path) -> Path:
     else:
         subprocess.run(["git", "clone", "-q", "--shared", "--no-checkout", str(REPOSITORY), str(folder)], check=True)
         subprocess.run(["git", "checkout", "-q", "--detach", resolved(commit)], cwd=folder, check=True)
-    subprocess.run([sys.executable, "build_backend/mudg_build.py", "--inplace"], cwd=folder, check=True, capture_output=True)
     return folder
+
+
+def build(checkout: Path, built: Path | None) -> None:
+    """The checkout's native library: that of another checkout where its sources are the same, else compiled."""
+    native = [side / "src" / "mudg" / "native" for side in (checkout, built) if side is not None]
+    sources = [{p.name: p.read_bytes() for p in side.rglob("*") if p.suffix in (".cpp", ".h", ".hpp")} for side in native]
+    if built is not None and sources[0] == sources[1]:
+        for path in native[1].iterdir():
+            if path.is_file() and not (native[0] / path.name).exists():
+                shutil.copy2(path, native[0] / path.name)
+    else:
+        subprocess.run([sys.executable, "build_backend/mudg_build.py", "--inplace"], cwd=checkout, check=True, capture_output=True)
 
 
 def resolved(commit: str) -> str:
@@ -321,6 +332,7 @@ def main() -> int:
         for side, commit in (("before", options.before), ("after", options.after)):
             (root / side).mkdir()
             sides.append(check_out(commit, root / side / "checkout"))
+            build(sides[-1], sides[0] if len(sides) > 1 else None)
         write_inputs(sides[0], root / "in")
         works = (root / "before" / "work", root / "after" / "work")
         for work in works:
