@@ -277,6 +277,8 @@ def differences(name: str, left: Outcome, right: Outcome, works: tuple[Path, Pat
 
 def how_much(left: Path, right: Path) -> str:
     """By how much two files differ: largest difference of tensors or pixels, or the first differing place."""
+    if not (left.is_file() and right.is_file()):
+        return "removed meanwhile"
     try:
         if left.suffix == ".safetensors":
             from safetensors.numpy import load_file
