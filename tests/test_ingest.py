@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from toy_scene import ToyStreet
 
-from mudg import native
+from mudg import app, native
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.base.run_folder import RunDir
@@ -23,6 +23,7 @@ from mudg.data.scene import read_image, read_label, read_points, read_scene, wri
 from mudg.data.scene.schema import scene_to_json_text
 from mudg.stages import ingest
 from mudg.stages.config import IngestConfig
+from mudg.steps.ingest import Ingest
 
 needs_native = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 TINY_CITY = CityConfig(
@@ -85,26 +86,26 @@ def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp
     ],
 )
 def test_words_of_the_command_line(words: list[str], out: str | None, expected: tuple[str, str, str]) -> None:
-    config, log, folder = ingest.parse_arguments(words, Path(out) if out else None, IngestConfig())
-    assert (config.format, log, str(folder)) == expected
+    step, _ = app.parse(["ingest", *words, *(["--out", out] if out else [])])
+    assert isinstance(step, Ingest) and (step.settings.format, step.log, str(step.out)) == expected
 
 
 @pytest.mark.parametrize(
     ("words", "out", "expected"),
     [
         ([], None, "no log"),
-        (["log"], None, "no folder"),
-        (["kitti", "log"], None, "no folder"),
+        (["log"], None, "no --out"),
+        (["kitti", "log"], None, "no --out"),
         (["waymoo", "log", "o"], None, "no such format"),
-        ([".", "o", "p"], None, "too many arguments"),
-        ([".", "o"], "p", "too many arguments"),
+        ([".", "o", "p"], None, "too many words"),
+        ([".", "o"], "p", "too many words"),
     ],
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
     with pytest.raises(UsageError, match=expected):
-        ingest.parse_arguments(words, Path(out) if out else None, IngestConfig())
-    with pytest.raises(UsageError, match="two formats"):
-        ingest.parse_arguments(["custom", "log", "o"], None, IngestConfig(format="kitti"))
+        app.parse(["ingest", *words, *(["--out", out] if out else [])])
+    with pytest.raises(UsageError, match="--format was given twice"):
+        app.parse(["ingest", "custom", "log", "o", "--format", "kitti"])
     with pytest.raises(UsageError, match="no such format") as caught:
         ingest.run(IngestConfig(format="rosbag"), "log", Path("o"))
     assert "kitti" in caught.value.expected

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,40 +100,6 @@ def _alignment(scene: Scene) -> dict[str, Any]:
     for name, one in found.items():
         (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.describe(name, one)}")
     return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
-
-
-def parse_arguments(
-    words: Sequence[str], out: Path | None, config: IngestConfig, *, many: bool = False
-) -> tuple[IngestConfig, str, Path]:
-    """Understand ``[FORMAT] LOG [OUT]`` beside ``--out``; with a list, ``[FORMAT] [OUT]``.
-
-    Returns:
-        Settings, the log (empty with a list), and the folder to write.
-
-    Raises:
-        UsageError: words are missing or too many, or a format is given twice.
-    """
-    left = list(words)
-    formats = ("auto", *IMPORTERS)
-    logs = 0 if many else 1
-    named = len(left) > 0 and left[0] in formats and (len(left) > logs + (out is None) or not Path(left[0]).exists())
-    if named:
-        if config.format not in ("auto", left[0]):
-            raise UsageError("two formats were given", got=f"{left[0]} and --format {config.format}")
-        config = replace(config, format=left.pop(0))
-    usage = "mudg ingest [FORMAT] LOG OUT, or mudg ingest [FORMAT] --list FILE --out ROOT"
-    source = "" if many or not left else left.pop(0)
-    if not many and not source:
-        raise UsageError("no log was given", expected=usage)
-    if left and out is None:
-        out = Path(left.pop(0))
-    if left:
-        if not many and not Path(source).exists() and source != CITY:
-            raise UsageError("no such format and no such log", expected=", ".join(formats), got=source)
-        raise UsageError("too many arguments", expected=usage, got=" ".join([source, *left]))
-    if out is None:
-        raise UsageError("no folder to write was given", expected=usage)
-    return config, source, out
 
 
 def run_many(

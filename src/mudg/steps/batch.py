@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mudg.steps.run import Preset
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.stages.config import BatchConfig
+    from mudg.stages.config import BatchConfig, PresetName
 
 OUT = Flag("OUT", "first")
 
@@ -32,7 +31,7 @@ class BatchRun(Step):
     """Folder, or address in an object store (s3://bucket/runs), for results and records."""
     config: Annotated[Path | None, Flag("FILE.yaml")] = None
     """Settings of the steps: a file of mudg run."""
-    preset: Preset = "default"
+    preset: PresetName = "default"
     """Settings of the steps to start from, as for mudg run."""
     set: Annotated[tuple[str, ...], Flag("STEP.NAME=VALUE ...")] = ()
     """Settings of the steps, over those of --config, as fit.iterations=500 device=cpu."""

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mudg.steps.outputs import Output
-from mudg.steps.run import Preset
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.stages.config import BenchConfig
+    from mudg.stages.config import BenchConfig, PresetName
 
 
 class Bench(Output):
@@ -39,7 +38,7 @@ class Bench(Output):
     sources: Annotated[tuple[Path, ...], Flag("[LOG ...]", "rest")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
     generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities."""
-    preset: Preset = "default"
+    preset: PresetName = "default"
     """shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the
     published set-up, with a published-type model."""
     settings: BenchConfig

@@ -58,9 +58,11 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
     its_own = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     common = Common(**{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own})
-    by_words = cls.from_words(found.words)
-    for name in by_words.keys() & own.keys():
-        raise UsageError(f"{flag_name(name)} was given twice", got=f"{by_words[name]!r} and {own[name]!r}", expected=usage(cls))
+    by_words = cls.from_words(found.words, own)
+    for name in by_words.keys() & (own.keys() | given.keys()):
+        twice = f"{by_words[name]!r} and {(own | given)[name]!r}"
+        raise UsageError(f"{flag_name(name)} was given twice", got=twice, expected=usage(cls))
+    given |= {name: by_words.pop(name) for name in by_words.keys() - its_own}
     common = dataclasses.replace(
         common, **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)}
     )

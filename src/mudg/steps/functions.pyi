@@ -492,7 +492,7 @@ def import_asset(
 def ingest(
     log: str = '',
     *,
-    out: str | Path = ...,
+    out: str | Path,
     overwrite: bool = False,
     list: str | Path | None = None,
     shard: str = '',
@@ -517,7 +517,7 @@ def ingest(
 
     Args:
         log: LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not recognised. OUT: the folder to write, in place of --out.
-        out: Folder to write, if it is not given after LOG. A finished result of the same settings and inputs is reused.
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
         shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.

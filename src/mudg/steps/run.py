@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mudg.steps.outputs import Output
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.stages.config import RunConfig
-
-Preset = Literal["fast", "default", "quality", "paper"]
-
+    from mudg.stages.config import PresetName, RunConfig
 
 class Run(Output):
     """Run all steps on your own driving log or scene and write a report page."""
@@ -23,7 +20,7 @@ class Run(Output):
     short = ("device", "adaptation", "continue_fit")
     source: Annotated[str, Flag("SOURCE", "first")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
-    preset: Preset | None = None
+    preset: PresetName | None = None
     """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000
     iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
     fast: bool = False
@@ -63,7 +60,7 @@ class Demo(Output):
     short = ("device", "adaptation", "continue_fit")
     out: Annotated[Path, Flag()] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
-    preset: Preset | None = None
+    preset: PresetName | None = None
     """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000
     iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
     fast: bool = False

@@ -78,8 +78,8 @@ class Step:
         return ()
 
     @classmethod
-    def from_words(cls, words: Sequence[str]) -> dict[str, Any]:
-        """Values of fields by the words without a flag.
+    def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of fields, and of settings, by the words without a flag. given: values of fields by flags.
 
         Raises:
             UsageError: a word is missing or too many.
@@ -247,7 +247,7 @@ def usage(cls: type[Step]) -> str:
         flag, needed = flag_of(cls, field.name), field.default is MISSING
         if flag.position in ("first", "rest"):
             words.append(flag.metavar if needed or "[" in flag.metavar else f"[{flag.metavar}]")
-        elif needed:
+        elif needed and f"[{field.name.upper()}]" not in " ".join(words):
             words.append(f"{flag_name(field.name)} {flag.metavar}")
     return " ".join([*words, "[flags]"])
 

@@ -19,10 +19,8 @@ class LearnData:
     """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
 
     STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "weathers": ("textures", 0), "effect_dropout": ("textures", 0.1),
-    }  # fmt: skip
     """Settings that may be addresses of an object store."""
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weathers": ("textures", 0), "effect_dropout": ("textures", 0.1)}
     width: int = Field(default=192, ge=32)
     """Width of the training images in pixels."""
     height: int = Field(default=128, ge=32)

@@ -66,15 +66,6 @@ def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False)
         return result.finish({"format": found, "inputs": inputs})
 
 
-def refuse_import_settings(config: ImportConfig, name: str) -> None:
-    """UsageError for settings that ``asset export`` does not have, or without the name of an object."""
-    if config != ImportConfig():
-        raise UsageError("an asset export takes no settings of imports", where="--kind, --label, --length-m, --yaw-deg, --origin-m, --axes",
-            remedy="leave them out")  # fmt: skip
-    if not name:
-        raise UsageError("no object was named", expected="mudg asset export RUN ID --out FILE")
-
-
 def refuse_other_settings(config: ImportConfig) -> None:
     """UsageError for settings that belong to the other kind."""
     usual = ImportConfig()
