@@ -198,17 +198,6 @@ def make_folder(path: Path) -> None:
         Path(path).mkdir(parents=True, exist_ok=True)
 
 
-def append_blocks(path: Path, blocks: Iterable[bytes], begin: int) -> None:
-    """Write blocks into a file under a temporary name, from byte ``begin`` on; what an earlier try left behind it is cut off."""
-    make_folder(path.parent)
-    with _writing(path), Path(path).open("ab" if begin else "wb") as handle:
-        handle.truncate(begin)
-        for block in blocks:
-            handle.write(block)
-        handle.flush()
-        os.fsync(handle.fileno())
-
-
 def take_place(temporary: Path, path: Path) -> None:
     """Give a file that is complete its name."""
     with _writing(path):
