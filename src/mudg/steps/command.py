@@ -56,7 +56,7 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
         _refuse_unknown(cls, unknown[0], listed)
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
     own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
-    its_own = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    its_own = {field.name for field in dataclasses.fields(cls)}
     common = Common(**{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own})
     by_words = cls.from_words(found.words, own)
     for name in by_words.keys() & (own.keys() | given.keys()):
@@ -196,7 +196,7 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
 def _row(cls: type[Step], option: Option, whole: bool) -> list[str]:
     """The lines of one flag."""
     position, metavar = "", ""
-    if option.own and option.name in {field.name for field in dataclasses.fields(cls)}:  # type: ignore[arg-type]
+    if option.own and option.name in {field.name for field in dataclasses.fields(cls)}:
         about = flag_of(cls, option.name)
         position, metavar = about.position, about.metavar
     head = flag_name(option.name)

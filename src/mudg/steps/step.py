@@ -61,6 +61,8 @@ class Step:
     """Settings that `--help` lists; `--help-all` lists all. Empty: all."""
     parts: ClassVar[Mapping[str, str]] = {}
     """First words that choose what the verb does, each with a page of help of its own, and what each does."""
+    if typing.TYPE_CHECKING:
+        __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
     def __init_subclass__(cls) -> None:
         dataclass(frozen=True, kw_only=True)(cls)
