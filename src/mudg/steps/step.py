@@ -132,7 +132,7 @@ class Step:
         """
         from pydantic import TypeAdapter, ValidationError
 
-        known = {field.name: field for field in fields(cls) if field.name != "settings"}  # type: ignore[arg-type]
+        known = {field.name: field for field in fields(cls) if field.name != "settings"}
         checked: dict[str, Any] = {}
         for name, value in values.items():
             if name not in known:
@@ -165,7 +165,7 @@ class Step:
 
 def perform(step: Step) -> Any:
     """Run a step; where it takes a part of a run, the folder of a run will do."""
-    parts = [field.name for field in fields(step) if flag_of(type(step), field.name).part]  # type: ignore[arg-type]
+    parts = [field.name for field in fields(step) if flag_of(type(step), field.name).part]
     if parts:
         from mudg.stages.editing import runs
 
@@ -368,7 +368,7 @@ def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
         twice = sorted(values.keys() & given.keys())
         if twice:
             raise UsageError(f"mudg.{name} was given {twice[0]} twice")
-        own = {field.name for field in fields(cls) if field.name != "settings"}  # type: ignore[arg-type]
+        own = {field.name for field in fields(cls) if field.name != "settings"}
         values |= {key: value for key, value in given.items() if key in own}
         settings = {key: _plain(value) for key, value in given.items() if key not in own}
         if settings and cls.settings_type() is None:
@@ -402,7 +402,7 @@ def signature(cls: type[Step]) -> inspect.Signature:
     """Arguments of the function: inputs in order, then by name alone the output, other inputs, the YAML file and every setting."""
     kinds = inspect.Parameter
     first, later = [], []
-    for field in fields(cls):  # type: ignore[arg-type]
+    for field in fields(cls):
         if field.name == "settings":
             continue
         at = kinds.POSITIONAL_OR_KEYWORD if flag_of(cls, field.name).position else kinds.KEYWORD_ONLY
