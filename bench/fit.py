@@ -28,11 +28,14 @@ from mudg.base import log
 from mudg.core.raster import cpu as raster_cpu
 from mudg.data.city.config import CityConfig
 from mudg.models.scene.densify import DensifyStats
-from mudg.stages import fit, fuse, ingest
+from mudg.stages import fit
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
 from mudg.stages.config.fit import DensifyConfig
 from mudg.stages.fitting.finite import FiniteCheck
 from mudg.stages.fitting.views import StoredView, ViewSet
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 FORWARD = ("project", "sort", "bin", "blend")
 BACKWARD = ("blend_backward", "project_backward")
@@ -113,8 +116,8 @@ def street(folder: Path, frames: int, size: str, cameras: int) -> tuple[Path, Pa
     names = ("front", "front_left", "front_right")[:cameras]
     city = CityConfig(seed=3, n_frames=frames, width=width, height=height, cameras=names)
     root = folder / f"{frames}x{cameras}_{size}"
-    scene = ingest.run(IngestConfig(city=city), "city", root / "scene")
-    return scene, fuse.run(FuseConfig(), scene, root / "fuse")
+    scene = Ingest(log="city", out=root / "scene", settings=IngestConfig(city=city)).run()
+    return scene, Fuse(scene=scene, out=root / "fuse", settings=FuseConfig()).run()
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
@@ -148,7 +151,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
     fit.optimise, fit._densify_if_due = timed_optimise, count_steps
     with tempfile.TemporaryDirectory() as folder:
-        fit.run(config, scene, fused, Path(folder) / "fit")
+        Fit(scene=scene, fused=fused, out=Path(folder) / "fit", settings=config).run()
     clock.seconds["rest"] += taken["seconds"] - sum(clock.seconds.values())
     return {
         **taken, "iterations": config.iterations, "densify": config.densify.kind, "frames": options.frames, "cameras": options.cameras,

@@ -36,11 +36,13 @@ from mudg.data.city import CityConfig, CityWorld
 from mudg.data.cloudfile import read_fused
 from mudg.data.observations import ObservationSet, ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.stages import fit, fuse, ingest
+from mudg.stages import fit
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
 from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting import kept, views
 from mudg.stages.fitting.views import StoredView, ViewSet
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 GIB = 1 << 30
 FRAMES, CAMERAS = 4, ("front", "front_left")
@@ -77,8 +79,8 @@ def city_of(folder: Path, size: str) -> tuple[Scene, Path, ObservationSet]:
     width, height = (int(side) for side in size.split("x"))
     config = CityConfig(seed=3, n_frames=FRAMES, width=width, height=height, cameras=CAMERAS)
     root = folder / f"memory_{size}"
-    scene = ingest.run(IngestConfig(city=config, test_every=0), "city", root / "scene")
-    fused = fuse.run(FuseConfig(), scene, root / "fuse")
+    scene = Ingest(log="city", out=root / "scene", settings=IngestConfig(city=config, test_every=0)).run()
+    fused = Fuse(scene=scene, out=root / "fuse", settings=FuseConfig()).run()
     if not (root / "virtual" / "observations.json").is_file():
         world = CityWorld(config)
         with ObservationWriter(root / "virtual", "shifted", "truth") as writer:

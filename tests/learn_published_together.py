@@ -13,6 +13,7 @@ from toy_published import published_settings
 
 from mudg.base.processes import Interruption
 from mudg.stages import learn
+from mudg.steps.learn import Learn
 
 rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
@@ -28,10 +29,10 @@ def stop_after_two(config, folder, step, *rest):
 
 learn.draw_clips = stop_after_two
 try:
-    learn.run(published_settings(start, clips, **common), out)
+    Learn(out=out, settings=published_settings(start, clips, **common)).run()
 except KeyboardInterrupt:
     learn.draw_clips, Interruption.requested = draw, asked
 else:
     sys.exit("the run was not stopped")
-learn.run(published_settings(start, clips, **common, parallel="fsdp", recompute=True), out)
+Learn(out=out, settings=published_settings(start, clips, **common, parallel="fsdp", recompute=True)).run()
 dist.destroy_process_group()

@@ -14,6 +14,7 @@ from toy_clips import tiny
 from mudg.base.errors import NumericsError, UsageError
 from mudg.base.processes import Interruption
 from mudg.stages import learn
+from mudg.steps.learn import Learn
 
 rank, store, clips, out = int(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
@@ -32,7 +33,7 @@ def run_until(step, config, folder, stopper):
     asked = Interruption.requested
     learn.draw_clips = stop_then
     try:
-        learn.run(config, folder)
+        Learn(out=folder, settings=config).run()
     except KeyboardInterrupt:
         return True
     finally:
@@ -46,11 +47,11 @@ said["stopped under ddp"] = run_until(3, config, out / "parts", stopper=1)
 sharded = tiny(clips, **common, parallel="fsdp", recompute=True)
 said["stopped under fsdp"] = run_until(5, sharded, out / "parts", stopper=0)
 try:
-    learn.run(tiny(clips, batch_frames=8, lr=1e30, steps=20), out / "numerics")
+    Learn(out=out / "numerics", settings=tiny(clips, batch_frames=8, lr=1e30, steps=20)).run()
 except NumericsError as error:
     said["numerics"] = str(error)
 try:
-    learn.run(tiny(clips, batch_frames=4), out / "uneven")
+    Learn(out=out / "uneven", settings=tiny(clips, batch_frames=4)).run()
 except UsageError as error:
     said["uneven"] = str(error)
 (out / f"said_{rank}.json").write_text(json.dumps(said))

@@ -19,11 +19,15 @@ from mudg.data.clips.from_city import HELD_OUT
 from mudg.data.scene import read_image, read_scene
 from mudg.models.mdm import files
 from mudg.models.mdm.extended import extended
-from mudg.stages import adapt, fit, fuse, ingest
+from mudg.stages import adapt, ingest
 from mudg.stages.adapting import clips as adapt_clips
 from mudg.stages.adapting import lessons as adapt_lessons
 from mudg.stages.config import AdaptConfig, FuseConfig, IngestConfig
 from mudg.stages.fitting.storage import load_model
+from mudg.steps.adapt import Adapt
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 SIZE = (96, 64)
 
@@ -33,9 +37,12 @@ def log(tmp_path_factory):
     """A small drive, its cloud, a fit to it, and a tiny model that uses renders."""
     root = tmp_path_factory.mktemp("adapt")
     city = CityConfig(seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",), lidar_azimuth_step_deg=0.6)
-    ingest.run(IngestConfig(city=city, test_every=6), ingest.CITY, root / "scene")
-    fuse.run(FuseConfig(), root / "scene", root / "fuse")
-    fit.run(fit_config(method="street_gaussians", iterations=30, start__gaussians=8000), root / "scene", root / "fuse", root / "fit")
+    Ingest(log=ingest.CITY, out=root / "scene", settings=IngestConfig(city=city, test_every=6)).run()
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
+    Fit(
+        scene=root / "scene", fused=root / "fuse", out=root / "fit",
+        settings=fit_config(method="street_gaussians", iterations=30, start__gaussians=8000),
+    ).run()  # fmt: skip
     before = files.load("embedded-tiny")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=SIZE[0] * SIZE[1])
     files.save(extended(before, grown), root / "tiny", "", {})
@@ -51,7 +58,7 @@ def settings(log, **changes):
 
 
 def adapted(log, out, **changes):
-    return adapt.run(settings(log, **changes), log / "scene", log / "fuse", log / "fit", out)
+    return Adapt(scene=log / "scene", fused=log / "fuse", fitted=log / "fit", out=out, settings=settings(log, **changes)).run()
 
 
 def weights_of(model):
@@ -174,7 +181,7 @@ def test_held_out_frames_are_never_read(log, result, tmp_path):
     scene = read_scene(damaged)
     for frame in scene.frames_in("test"):
         (damaged / frame.image.path).write_bytes(b"not a picture")
-    again = adapt.run(settings(log), damaged, log / "fuse", log / "fit", tmp_path / "out")
+    again = Adapt(scene=damaged, fused=log / "fuse", fitted=log / "fit", out=tmp_path / "out", settings=settings(log)).run()
     assert weights_of(again) == weights_of(result / "model")
 
 
@@ -197,14 +204,16 @@ def test_an_interrupted_adaptation_continues_to_the_same_model(log, result, tmp_
 
 def test_what_cannot_be_adapted_is_refused(log, tmp_path):
     with pytest.raises(UsageError, match="renders"):
-        adapt.run(settings(log, model="embedded-tiny"), log / "scene", log / "fuse", log / "fit", tmp_path / "a")
+        Adapt(
+            scene=log / "scene", fused=log / "fuse", fitted=log / "fit", out=tmp_path / "a", settings=settings(log, model="embedded-tiny")
+        ).run()
     with pytest.raises(InputError, match="too short|cannot be adapted"):
         adapted(log, tmp_path / "b", block=20)
     assert not (tmp_path / "b").exists()
     other = tmp_path / "other"
     city = CityConfig(seed=6, n_frames=2, width=48, height=32, cameras=("front",), lidar_beams=4)
-    ingest.run(IngestConfig(city=city, contact_sheet=False), ingest.CITY, other)
+    Ingest(log=ingest.CITY, out=other, settings=IngestConfig(city=city, contact_sheet=False)).run()
     with pytest.raises(InputError, match="another log"):
-        adapt.run(settings(log), other, log / "fuse", log / "fit", tmp_path / "d")
+        Adapt(scene=other, fused=log / "fuse", fitted=log / "fit", out=tmp_path / "d", settings=settings(log)).run()
     with pytest.raises(InputError, match="camera"):
         adapted(log, tmp_path / "c", cameras=("rear",))

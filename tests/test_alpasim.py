@@ -23,8 +23,8 @@ from mudg.core.ground import HeightMap
 from mudg.data.splats import alpasim
 from mudg.data.splats.cloud import SplatScene
 from mudg.stages.config import ExportConfig
-from mudg.stages.exporting import export
 from mudg.stages.fitting.storage import save_model
+from mudg.steps.export import Export
 
 TIMES = np.array([0.0, 0.2, 0.4])
 
@@ -201,7 +201,7 @@ def test_the_command_needs_a_drive(tmp_path: Path) -> None:
         alpasim.to_package(scene, drive(), None)
     save_model(toy_fitted(0), tmp_path / "fit")
     with pytest.raises(InputError, match="--scene"):
-        export.run(ExportConfig(), "alpasim", tmp_path / "fit", tmp_path / "a.usdz")
+        Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig()).run()
     with pytest.raises(UsageError, match="holds all moments"):
-        export.run(ExportConfig(time_s=0.2), "alpasim", tmp_path / "fit", tmp_path / "a.usdz")
+        Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig(time_s=0.2)).run()
     assert not (tmp_path / "a.usdz").exists()

@@ -11,7 +11,6 @@ import pytest
 from toy_scene import CAR_SIZE_M, ToyStreet
 
 from mudg.base import geometry
-from mudg.base.config import result_settings
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import ID, UNLABELLED
@@ -28,6 +27,7 @@ from mudg.stages.config import AnnotateConfig
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import steady_bottom
 from mudg.stages.labelling.points import nearest_sweeps
+from mudg.steps.annotate import Annotate
 
 STREET = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0))
 
@@ -177,7 +177,7 @@ def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
 def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: Path) -> None:
     plain = STREET.write(tmp_path / "plain", labels=False)
     files = {p: p.read_bytes() for p in (tmp_path / "plain").rglob("*") if p.is_file()}
-    out = annotate.run(AnnotateConfig(depth=True), tmp_path / "plain", tmp_path / "labelled")
+    out = Annotate(scene=tmp_path / "plain", out=tmp_path / "labelled", settings=AnnotateConfig(depth=True)).run()
     scene = read_scene(out)
     assert files == {p: p.read_bytes() for p in (tmp_path / "plain").rglob("*") if p.is_file()}
     assert [f.id for f in scene.frames] == [f.id for f in plain.frames]
@@ -194,13 +194,13 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
     assert "not truth" in (out / "labels.html").read_text()
     assert not (out / "labelled").exists()
     before_ns = (out / "scene.json").stat().st_mtime_ns
-    assert annotate.run(AnnotateConfig(depth=True), tmp_path / "plain", out) == out
+    assert Annotate(scene=tmp_path / "plain", out=out, settings=AnnotateConfig(depth=True)).run() == out
     assert (out / "scene.json").stat().st_mtime_ns == before_ns
 
 
 def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
     given = STREET.write(tmp_path / "given")
-    scene = read_scene(annotate.run(AnnotateConfig(dynamic=False), tmp_path / "given", tmp_path / "out"))
+    scene = read_scene(Annotate(scene=tmp_path / "given", out=tmp_path / "out", settings=AnnotateConfig(dynamic=False)).run())
     for frame, before in zip(scene.frames, given.frames, strict=True):
         assert set(frame.labels) == set(before.labels)
         assert (read_label(scene, frame, "semantics") == read_label(given, before, "semantics")).all()
@@ -216,13 +216,13 @@ def test_a_scene_with_images_only_can_be_labelled(tmp_path: Path) -> None:
         writer.add_frame("front/000000", view, street.image(view)[0])
         writer.set_ego(EgoPath(np.zeros(1), np.eye(4)[None]))
         writer.finish()
-    scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "s", tmp_path / "out"))
+    scene = read_scene(Annotate(scene=tmp_path / "s", out=tmp_path / "out", settings=AnnotateConfig()).run())
     assert overlap(read_label(scene, scene.frames[0], "semantics"), street.image(view)[1], "sky") > 0.9
 
 
 def test_movers_are_carried_and_marked(tmp_path: Path) -> None:
     replace(STREET, times=(0.0, 0.4)).write(tmp_path / "plain", labels=False, width=160, height=80)
-    scene = read_scene(annotate.run(AnnotateConfig(), tmp_path / "plain", tmp_path / "out"))
+    scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=AnnotateConfig()).run())
     for frame in scene.frames:
         _, truth, depth = STREET.image(frame.view)
         found = read_label(scene, frame, "dynamic").astype(bool)
@@ -235,11 +235,10 @@ def test_movers_are_carried_and_marked(tmp_path: Path) -> None:
 def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     replace(STREET, times=(0.0, 0.1, 0.2)).write(tmp_path / "plain", labels=False, width=96, height=48)
     config = AnnotateConfig(labeller="geometry")
-    whole = annotate.run(config, tmp_path / "plain", tmp_path / "whole")
+    whole = Annotate(scene=tmp_path / "plain", out=tmp_path / "whole", settings=config).run()
     plain = read_scene(tmp_path / "plain")
-    settings = result_settings(config)
-    settings.pop("processes")
-    begun = RunDir.open(tmp_path / "begun", annotate._OUTPUT, settings, annotate.inputs_of(config, tmp_path / "plain"))
+    step = Annotate(scene=tmp_path / "plain", out=tmp_path / "begun", settings=config)
+    begun = RunDir.open(step.out, step.output(), step.key_settings(), step.inputs())
     aside = tmp_path / "begun" / "labelled"
     first = [frame.id for frame in plain.frames[:2]]
     assert list(annotate.label_into_staging(config, plain, first, aside)) == first
@@ -256,7 +255,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(annotate, "label_into_staging", watched)
-        again = annotate.run(config, tmp_path / "plain", tmp_path / "begun")
+        again = step.run()
     assert made == [frame.id for frame in plain.frames[2:]]
     for path in sorted((whole / "labels").rglob("*.*")):
         assert path.read_bytes() == (again / path.relative_to(whole)).read_bytes()
@@ -288,8 +287,8 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     network = lambda given: Prediction(next(answers), "depth")  # noqa: E731
     monkeypatch.setattr(annotate_depth, "load", lambda config: network if config.depth_network else None)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
-    scene = read_scene(annotate.run(config, tmp_path / "plain", tmp_path / "out"))
-    by_points = read_scene(annotate.run(AnnotateConfig(processes=1), tmp_path / "plain", tmp_path / "filled"))
+    scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
+    by_points = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "filled", settings=AnnotateConfig(processes=1)).run())
     first, second = (read_label(scene, frame, "depth") for frame in scene.frames)
     seen = ~read_label(scene, scene.frames[0], "sky").astype(bool) & np.isfinite(street.image(plain.frames[0].view)[2])
     assert np.median(np.abs(first / truth[plain.frames[0].id] - 1)[seen]) < 1e-2
@@ -301,7 +300,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     assert not list((tmp_path / "out").rglob("*.filled.json"))
     (tmp_path / "weights" / "model.safetensors").write_bytes(b"other weights")
     with pytest.raises(UsageError, match="depth_network"):
-        annotate.run(config, tmp_path / "plain", tmp_path / "out")
+        Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run()
 
 
 def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:

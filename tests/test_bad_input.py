@@ -21,8 +21,11 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.importers import IMPORTERS
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import check_scene, decode_image, read_image, read_points, read_scene, write_zip
-from mudg.stages import annotate, fuse, ingest, run
 from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig, RunConfig
+from mudg.steps.annotate import Annotate
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
+from mudg.steps.run import Run
 
 IMAGE = "image_02/data/0000000003.png"
 SCAN = "velodyne_points/data/0000000003.bin"
@@ -237,9 +240,9 @@ def test_unknown_camera_and_missing_files_named_by_flags(drive: Path, tmp_path: 
 
 
 def through(source: Path, tmp_path: Path) -> tuple[Any, Any]:
-    scene_path = ingest.run(IngestConfig(), source, tmp_path / "scene")
-    labelled = annotate.run(AnnotateConfig(), scene_path, tmp_path / "labelled")
-    return read_scene(labelled), read_fused(fuse.run(FuseConfig(min_object_points=1), labelled, tmp_path / "fuse"))
+    scene_path = Ingest(log=source, out=tmp_path / "scene", settings=IngestConfig()).run()
+    labelled = Annotate(scene=scene_path, out=tmp_path / "labelled", settings=AnnotateConfig()).run()
+    return read_scene(labelled), read_fused(Fuse(scene=labelled, out=tmp_path / "fuse", settings=FuseConfig(min_object_points=1)).run())
 
 
 def test_no_tracks(drive: Path, tmp_path: Path) -> None:
@@ -263,12 +266,12 @@ def test_no_lidar(drive: Path, tmp_path: Path) -> None:
     shutil.rmtree(drive / "velodyne_points")
     scene = IMPORTERS["kitti"](drive, tmp_path / "scene", ImportOptions())
     assert scene.sweeps == ()
-    assert annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "annotated").is_dir()
+    assert Annotate(scene=tmp_path / "scene", out=tmp_path / "annotated", settings=AnnotateConfig()).run().is_dir()
     with pytest.raises(InputError, match="no LiDAR sweeps"):
-        fuse.run(FuseConfig(), tmp_path / "annotated", tmp_path / "fused")
+        Fuse(scene=tmp_path / "annotated", out=tmp_path / "fused", settings=FuseConfig()).run()
     assert not (tmp_path / "fused").exists()
     with pytest.raises(InputError, match="no LiDAR sweeps"):
-        run.run_chain(RunConfig(), drive, tmp_path / "run")
+        Run(source=drive, out=tmp_path / "run", settings=RunConfig()).run()
     assert not (tmp_path / "run" / "annotate").exists()  # before minutes of work, not after
     assert any("no LiDAR" in f.message and f.level == "warning" for f in check_scene(scene.root))
 
@@ -284,7 +287,7 @@ def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:
 def test_one_camera_of_several_is_enough(tmp_path: Path) -> None:
     scene = ToyStreet(times=(0.0, 0.1)).write(tmp_path / "scene")
     assert list(scene.cameras) == ["front"]
-    assert len(annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "out").name) > 0
+    assert len(Annotate(scene=tmp_path / "scene", out=tmp_path / "out", settings=AnnotateConfig()).run().name) > 0
 
 
 # --- broken scenes reach every stage the same way -----------------------------------------------------------------------
@@ -356,8 +359,8 @@ def test_broken_scene(case: str, verb: str, good_scene: Path, tmp_path: Path) ->
     shutil.copytree(good_scene, root)
     spoil(root)
     run = {
-        "fuse": lambda: fuse.run(FuseConfig(), root, tmp_path / "out"),
-        "annotate": lambda: annotate.run(AnnotateConfig(), root, tmp_path / "out"),
+        "fuse": lambda: Fuse(scene=root, out=tmp_path / "out", settings=FuseConfig()).run(),
+        "annotate": lambda: Annotate(scene=root, out=tmp_path / "out", settings=AnnotateConfig()).run(),
     }
     with pytest.raises(InputError) as caught:
         run[verb]()
@@ -372,9 +375,9 @@ def test_output_that_cannot_be_written(tmp_path: Path) -> None:
     ToyStreet(times=(0.0,)).write(tmp_path / "scene")
     (tmp_path / "file").write_text("in the way")
     for act in (
-        lambda: fuse.run(FuseConfig(), tmp_path / "scene", tmp_path / "file" / "out"),
-        lambda: ingest.run(IngestConfig(), tmp_path / "scene", tmp_path / "file" / "out"),
-        lambda: annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "file" / "out"),
+        lambda: Fuse(scene=tmp_path / "scene", out=tmp_path / "file" / "out", settings=FuseConfig()).run(),
+        lambda: Ingest(log=tmp_path / "scene", out=tmp_path / "file" / "out", settings=IngestConfig()).run(),
+        lambda: Annotate(scene=tmp_path / "scene", out=tmp_path / "file" / "out", settings=AnnotateConfig()).run(),
     ):
         with pytest.raises(MudgError) as caught:
             act()

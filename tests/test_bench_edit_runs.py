@@ -21,10 +21,13 @@ from mudg.core import edit_scores
 from mudg.core.table import Table
 from mudg.data.cloudfile import write_fused
 from mudg.data.edits import parse_edits
-from mudg.stages import annotate, fit, fuse, ingest
 from mudg.stages.config import AnnotateConfig, BenchConfig, FuseConfig, IngestConfig
 from mudg.stages.editing.runs import find_run
 from mudg.stages.fitting.storage import load_model
+from mudg.steps.annotate import Annotate
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 FRAMES = 4
 
@@ -36,7 +39,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
     write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
     config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
-    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
     return root
 
 
@@ -173,11 +176,11 @@ def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path, 
 @pytest.mark.slow
 def test_a_recorded_drive(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     root = tmp_path / "kitti"
-    ingest.run(IngestConfig(resolution="320", contact_sheet=False), shared_data("kitti_2011_09_26"), tmp_path / "raw")
-    annotate.run(AnnotateConfig(), tmp_path / "raw", root / "scene")
-    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    Ingest(log=shared_data("kitti_2011_09_26"), out=tmp_path / "raw", settings=IngestConfig(resolution="320", contact_sheet=False)).run()
+    Annotate(scene=tmp_path / "raw", out=root / "scene", settings=AnnotateConfig()).run()
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
-    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
     out = bench.run("edit", BenchConfig(), tmp_path / "out", sources=[root])
     rows = {row["edit"]: row for row in store.read_json(out / "bench.json")["rows"]}
     assert rows["remove"]["object"] == "0" and rows["remove"]["outside"] < 0.03

@@ -17,7 +17,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.benchmarks import page, paper, papers, places, views
 from mudg.benchmarks import run as bench
-from mudg.benchmarks.chain import write_fill
+from mudg.benchmarks.chain import FillViews
 from mudg.benchmarks.papers import PAPERS, RECORDED, SCENE_LISTS, TABLES
 from mudg.benchmarks.rows import LONGER, paper_rows
 from mudg.core import trajectory
@@ -28,8 +28,10 @@ from mudg.data.scene import read_scene
 from mudg.methods import METHODS
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages import fuse, ingest
+from mudg.stages import ingest
 from mudg.stages.config import BenchConfig, FitConfig, FuseConfig, IngestConfig, ScoreConfig, SynthesizeConfig
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 PSNR, FID = PAPERS.columns["psnr"], PAPERS.columns["fid"]
 TOY_YAML = """
@@ -343,7 +345,7 @@ def recorded(tmp_path_factory):
     """A scene of 8 frames and two cameras, whose folder bears the name of a segment."""
     city = CityConfig(n_frames=8, width=64, height=48, cameras=("front", "front_left"), seed=2100000, lidar_azimuth_step_deg=1.0)
     out = tmp_path_factory.mktemp("logs") / "segment-12820461091157089924_with_camera_labels"
-    return ingest.run(IngestConfig(test_every=0, contact_sheet=False, city=city), ingest.CITY, out)
+    return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=city)).run()
 
 
 def test_lists_of_cities_and_folders(recorded):
@@ -379,9 +381,9 @@ def test_pictures_without_truth(recorded, tmp_path):
     """Rows of colour and depth alone, all columns, in full size; nothing for a column without the trajectory."""
     scene = read_scene(recorded)
     paths = [trajectory.shifted(scene, "front", 2.0), trajectory.named(scene, "front", "lane+0.1")]
-    fused = fuse.run(FuseConfig(), recorded, tmp_path / "fused")
-    one, both = (write_fill(recorded, fused, paths[:n], tmp_path / f"fill{n}") for n in (1, 2))
-    out = page.film({"one": one, "both": (both,)}, paths, tmp_path / "film", videos=False)
+    fused = Fuse(scene=recorded, out=tmp_path / "fused", settings=FuseConfig()).run()
+    one, both = (FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}").run() for n in (1, 2))
+    out = page.Film(views={"one": (one,), "both": (both,)}, paths=tuple(paths), videos=False, out=tmp_path / "film").run()
     assert sorted(path.name for path in out.glob("*.jpg")) == ["front_lane+0.1.jpg", "front_shift+2.0.jpg"]
     with Image.open(out / "front_lane+0.1.jpg") as picture:
         seen = np.asarray(picture.convert("L"))

@@ -26,7 +26,7 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_image, read_scene
 from mudg.models.published import files as published_files
 from mudg.models.published.video_unet import VideoUNet
-from mudg.stages import fuse, ingest
+from mudg.stages import ingest
 from mudg.stages.config import (
     BenchConfig,
     FitConfig,
@@ -37,6 +37,8 @@ from mudg.stages.config import (
     run_preset,
 )
 from mudg.stages.synthesize import recorded_images
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 MODALITIES = 3
 
@@ -54,7 +56,7 @@ def scene(tmp_path_factory):
     """A log of six frames of one camera."""
     city = CityConfig(n_frames=6, width=64, height=48, cameras=("front",), seed=2100000, lidar_azimuth_step_deg=1.0)
     out = tmp_path_factory.mktemp("logs") / "city"
-    return ingest.run(IngestConfig(test_every=0, contact_sheet=False, city=city), ingest.CITY, out)
+    return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=city)).run()
 
 
 @pytest.fixture
@@ -257,7 +259,7 @@ def test_real_runs_with_a_published_type_model_as_recorded(weights, scene, tmp_p
 def sources(scene, tmp_path_factory):
     """What conditions are made of, and the same with other points and with other recorded images."""
     loaded = read_scene(scene)
-    cloud = read_fused(fuse.run(FuseConfig(), scene, tmp_path_factory.mktemp("cloud") / "fuse"))
+    cloud = read_fused(Fuse(scene=scene, out=tmp_path_factory.mktemp("cloud") / "fuse", settings=FuseConfig()).run())
     photos = recorded_images(loaded, SynthesizeConfig())
     given = ConditionSources(cloud, loaded.tracks, photos, ConditionRules(32, 32, 64, 48, published=True))
     dark = dataclasses.replace(cloud.static, rgb=255 - np.asarray(cloud.static.rgb), xyz=cloud.static.xyz * 1.1)

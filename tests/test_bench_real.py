@@ -16,7 +16,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
 from mudg.benchmarks import columns, places, real, truth
-from mudg.benchmarks.chain import Chain, write_fill
+from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
 from mudg.core import color_match, points_seen
@@ -28,7 +28,7 @@ from mudg.data.scene import SceneWriter, read_image, read_label, read_points, re
 from mudg.data.scene.part import write_part
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages import fuse, ingest, render
+from mudg.stages import ingest, render
 from mudg.stages.config import (
     AdaptConfig,
     BenchConfig,
@@ -38,6 +38,8 @@ from mudg.stages.config import (
     RenderConfig,
     SynthesizeConfig,
 )  # fmt: skip
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 CITY = {"n_frames": 6, "width": 96, "height": 64, "cameras": ("front", "front_left"), "seed": 2100000, "lidar_azimuth_step_deg": 0.6}
 BY_NAME = {protocol.name: protocol for protocol in PROTOCOLS}
@@ -48,7 +50,7 @@ def city(tmp_path_factory):
     from mudg.data.city.config import CityConfig
 
     out = tmp_path_factory.mktemp("log") / "city"
-    return ingest.run(IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY)), ingest.CITY, out)
+    return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY))).run()
 
 
 # ---- what is hidden ----------------------------------------------------------------------------------------------------
@@ -341,8 +343,10 @@ def exact(city, tmp_path_factory):
             with ObservationWriter(out / "views" / path.name, path.name, "truth") as writer:
                 for view in path.views:
                     writer.add(world.observation(view, world.render(view)))
-        targets = truth.write_targets(protocol, city, seen, held.frames, cameras, out / "truth")
-        scored = columns.write_scores(protocol, city, targets, out / "views", out / "score")
+        targets = truth.MakeTargets(
+            log=city, shown=seen, protocol=protocol, held=tuple(held.frames), cameras=cameras, out=out / "truth"
+        ).run()
+        scored = columns.ScoreTargets(log=city, truth=targets, views=out / "views", protocol=protocol, out=out / "score").run()
         return store.read_json(scored / "metrics.json")["mean"], truth.read_targets(targets)
 
     return of
@@ -531,7 +535,7 @@ def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
         job.write_seen(read_scene(tmp_path / name), places.HeldOut())
         found.append((job.chain().fuse() / "static.safetensors").read_bytes())
     assert found[0] == found[1]
-    given = fuse.run(FuseConfig(), tmp_path / "a", tmp_path / "told")  # from the whole log the cloud takes them over
+    given = Fuse(scene=tmp_path / "a", out=tmp_path / "told", settings=FuseConfig()).run()  # from the whole log the cloud takes them over
     assert (given / "static.safetensors").read_bytes() != found[0]
 
 
@@ -574,9 +578,9 @@ def test_pooled_values_leave_out_logs_without_a_number():
 
 
 def test_a_view_that_a_method_lacks_is_an_error(city, tmp_path):
-    fused = fuse.run(FuseConfig(), city, tmp_path / "fuse")
+    fused = Fuse(scene=city, out=tmp_path / "fuse", settings=FuseConfig()).run()
     paths = render.trajectories(read_scene(city), RenderConfig(cameras=("front",), shifts_m=(0.0,)))
-    views = write_fill(city, fused, paths, tmp_path / "views")
+    views = FillViews(scene=city, fused=fused, paths=paths, out=tmp_path / "views").run()
     finder = columns.ViewFinder(views)
     assert isinstance(finder.at(paths[0].views[1]), Observation)
     with pytest.raises(InputError, match="lacks a view"):

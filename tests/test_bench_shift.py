@@ -13,7 +13,7 @@ from mudg.base import seeds, store
 from mudg.base.errors import InputError, UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
-from mudg.benchmarks.chain import write_exact
+from mudg.benchmarks.chain import ExactViews
 from mudg.benchmarks.rows import LONGER, shift_rows
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
@@ -186,7 +186,7 @@ def test_exact_views_are_the_truth_beside_the_path_and_nothing_of_the_path(made,
     truth = made[0] / str(city_logs.DEVELOPMENT[0]) / "truth"
     names = sorted(path.name for path in truth.iterdir() if path.is_dir())
     paths = [SimpleNamespace(name=name, origin="shifted" if "shift" in name else "recorded") for name in names]
-    out = write_exact(truth, paths, tmp_path / "exact")
+    out = ExactViews(truth=truth, paths=tuple(paths), out=tmp_path / "exact").run()
     sets = list_observation_sets(out)
     assert sorted(sets) == [name for name in names if "shift" in name] != names
     seen, true = (read_observations(folder / "front_shift+3.0")[1] for folder in (out, truth))

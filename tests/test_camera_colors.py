@@ -20,9 +20,12 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.clips.condition import ConditionRules, build_conditions
 from mudg.data.cloudfile import read_fused
 from mudg.data.scene import SceneWriter, read_image, read_label, read_scene
-from mudg.stages import fit, fuse, ingest
+from mudg.stages import fit
 from mudg.stages.config import FuseConfig, IngestConfig
 from mudg.stages.fitting.rendering import render_view
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 DARK = ColorMap((1.4, 1.3, 1.2), (0.02, 0.0, -0.01), 1000)
 """To the common colours from those of a camera that takes darker images."""
@@ -90,7 +93,7 @@ def city(tmp_path_factory) -> tuple[Path, Path]:
     """A scene whose cameras are equal, and the same with a darker second camera; the first frame of each is held out."""
     root = tmp_path_factory.mktemp("city")
     config = configuration.load(IngestConfig, overrides={"city": SIZE, "test_every": 4})
-    ingest.run(config, "city", root / "equal")
+    Ingest(log="city", out=root / "equal", settings=config).run()
     scene = read_scene(root / "equal")
     with SceneWriter(root / "dark", scene.id, scene.source) as writer:
         writer.copy_all_but_frames(scene)
@@ -102,8 +105,8 @@ def city(tmp_path_factory) -> tuple[Path, Path]:
             writer.add_frame(frame.id, frame.view, DARK.inverse().of_bytes(read_image(scene, frame)), labels)
         writer.finish()
     for name in ("equal", "dark"):
-        fuse.run(FuseConfig(), root / name, root / f"{name}_fuse")
-    fuse.run(FuseConfig(match_colors=False), root / "dark", root / "dark_unmatched")
+        Fuse(scene=root / name, out=root / f"{name}_fuse", settings=FuseConfig()).run()
+    Fuse(scene=root / "dark", out=root / "dark_unmatched", settings=FuseConfig(match_colors=False)).run()
     return root / "equal", root / "dark"
 
 
@@ -145,7 +148,7 @@ def test_a_scene_has_common_colors_and_every_camera_shows_its_own(city, tmp_path
     """Renders of the darker camera are as dark as its images, before any training step has brought them there."""
     scene = read_scene(city[1])
     config = fit_config(method="street_gaussians", iterations=1, densify__kind="none")
-    model = fit.load_model(fit.run(config, city[1], city[1].parent / "dark_fuse", tmp_path / "fit"))
+    model = fit.load_model(Fit(scene=city[1], fused=city[1].parent / "dark_fuse", out=tmp_path / "fit", settings=config).run())
     assert model.colors == fused_of(city[1]).colors
     frame = scene.frames_of("front_left")[3]
     own = render_view(model, frame.view, RasterConfig(near_m=0.2)).rgb

@@ -31,6 +31,7 @@ from mudg.stages.fitting.certainty import (
 )
 from mudg.stages.fitting.rendering import render_condition
 from mudg.stages.fitting.views import LidarPixels, StoredView
+from mudg.steps.fit import Fit
 
 RASTER = RasterConfig(near_m=0.2)
 ROWS = 12
@@ -155,7 +156,7 @@ def fitted(tmp_path_factory) -> Path:
     write_scene(root / "scene", frames=6, width=60, height=40)
     write_fused(root / "fuse", fused_cloud(6), {})
     config = fit_config(method="street_gaussians", iterations=30, start__gaussians=900, densify__max_gaussians=1500)
-    return fit.run(config, root / "scene", root / "fuse", root / "fit")
+    return Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=config).run()
 
 
 def test_a_fit_stores_it_and_a_render_shows_it(fitted):

@@ -17,10 +17,10 @@ from mudg.data.clips.from_city import CityClipRules
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 from mudg.data.scene.photos import write_photos
 from mudg.models.mdm import files
-from mudg.stages import learn
 from mudg.stages.learning import city_fits
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
+from mudg.steps.learn import Learn
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
 RULES = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True)
@@ -112,7 +112,7 @@ def test_a_city_is_fitted_and_learnt_from(tmp_path):
     solid = (shown.alpha > 0.9) & (shifted.depth < 60)
     assert float(((shown.depth - shifted.depth).abs() / shifted.depth)[solid].median()) < 0.3
     config = tiny(tmp_path / "clips", cities=1, first_cities=1, window=2, steps=2, batch_frames=2, seed=0)
-    made = learn.run(config, tmp_path / "run")
+    made = Learn(out=tmp_path / "run", settings=config).run()
     model = files.load(made)
     assert model.finisher is not None and model.config.renders
     assert "fine_rgb" in (tmp_path / "run" / "log.jsonl").read_text()

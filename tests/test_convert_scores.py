@@ -16,9 +16,10 @@ from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.models import i3d, inception
-from mudg.stages import convert, score
 from mudg.stages.config import ConvertConfig, ScoreConfig
 from mudg.stages.scoring import converted
+from mudg.steps.convert import Convert
+from mudg.steps.score import Score
 
 STATES = {
     "inception": lambda: {**toy_inception.state(), "Conv2d_1a_3x3.bn.num_batches_tracked": torch.tensor(3)},
@@ -75,7 +76,9 @@ def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(inception, "KNOWN_SHA256", store.sha256_file(checkpoint))
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
-    out = score.run(ScoreConfig(fid_weights=str(weights), perceptual_views=0), scene, {"a": views}, tmp_path / "score")
+    out = Score(
+        scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(weights), perceptual_views=0)
+    ).run()
     assert store.read_json(out / "metrics.json")["distributions"]["published_weights"] is True
     store.write_safetensors(weights, {name: value + 1 for name, value in store.read_tensors(weights).items()})
     assert converted.source_sha256(weights) == store.sha256_file(weights)  # altered since: no longer the published ones
@@ -97,6 +100,6 @@ def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path)
     assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) != 0
     assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2", "--overwrite"]) == 0
     with pytest.raises(UsageError, match="diffusion models only"):
-        convert.run(ConvertConfig(network="dinov2", dtype="float16"), checkpoint, tmp_path / "other")
+        Convert(checkpoint=checkpoint, to=tmp_path / "other", settings=ConvertConfig(network="dinov2", dtype="float16")).run()
     with pytest.raises(InputError, match="no such checkpoint"):
-        convert.run(ConvertConfig(network="dinov2"), tmp_path / "missing.pth", tmp_path / "other")
+        Convert(checkpoint=tmp_path / "missing.pth", to=tmp_path / "other", settings=ConvertConfig(network="dinov2")).run()

@@ -24,12 +24,13 @@ from mudg.base.types import FusedCloud, PointCloud
 from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.observations import read_observations
 from mudg.pages import gallery, run_report
-from mudg.stages import convert, edit, run, score
+from mudg.stages import convert, edit, score
 from mudg.stages.config import RunConfig
 from mudg.stages.editing.runs import RunParts
 from mudg.stages.fitting.continued import StartFit
 from mudg.stages.learning.score import plot_losses
 from mudg.stages.scoring.detections import read_detections
+from mudg.steps import pipeline
 
 CASES = 24
 """Of each record, by seeded chance; there may be thousands."""
@@ -65,7 +66,7 @@ def observed(folder: Path) -> Path:
 
 
 def chain(folder: Path) -> Path:
-    ledger = run._Ledger(folder, {"verb": "run", "source": "city", **result_settings(RunConfig())}, {})
+    ledger = pipeline._Ledger(folder, {"verb": "run", "source": "city", **result_settings(RunConfig())}, {})
     ledger._steps = {"fit": {"state": "complete", "seconds": 1.5, "processor_s": 2.5, "peak_bytes": 3, "written_bytes": 4}}
     ledger._report = {"key": "k", "sha256": "s"}
     folder.mkdir()
@@ -76,7 +77,7 @@ def chain(folder: Path) -> Path:
 
 
 def read_chain(folder: Path) -> None:
-    ledger = run._Ledger.open(folder, RunConfig(), "city", False)
+    ledger = pipeline._Ledger.open(folder, RunConfig(), "city", False)
     store.write_text(folder / "report.html", "page")
     assert (ledger.has_report("k"), ledger.has_done("report")) == (False, False)
     assert ledger.rows().keys() == ledger.seconds().keys()

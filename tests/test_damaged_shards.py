@@ -13,7 +13,7 @@ from toy_clips import tiny, write_clips
 
 from mudg.base.errors import InputError
 from mudg.data.clips import shards as clip_shards
-from mudg.stages import learn
+from mudg.steps.learn import Learn
 
 Arrays = dict[str, np.ndarray]
 NOT_FINITE = ("depth", "sparse_depth", "render_depth", "world_from_cam", "intrinsics", "shift_m", "fine_depth", "fine_world_from_cam")
@@ -111,11 +111,11 @@ def test_learn_finds_a_damaged_shard_before_it_begins(kind: str, number: int, tm
     path = sorted(clips.iterdir())[number]
     path.write_bytes(DAMAGE[kind](path.read_bytes(), {}))
     with pytest.raises(InputError, match="damaged") as refused:
-        learn.run(tiny(clips), tmp_path / "out")
+        Learn(out=tmp_path / "out", settings=tiny(clips)).run()
     assert str(path) in refused.value.where
     left = {p.name for p in (tmp_path / "out").rglob("*") if p.is_file()}
     assert left <= {"run.json", "run.yaml", "log.jsonl", "lock"}
     shutil.rmtree(tmp_path / "clips")
     write_clips(tmp_path / "clips")
-    learn.run(tiny(clips), tmp_path / "out")
+    Learn(out=tmp_path / "out", settings=tiny(clips)).run()
     assert (tmp_path / "out" / "model" / "model.json").is_file()

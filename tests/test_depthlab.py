@@ -29,9 +29,10 @@ from mudg.models.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, kn
 from mudg.models.depth.inputs import DepthInput, DepthOptions
 from mudg.models.depth.networks import kind_of, load_depth_network
 from mudg.models.folders import Place
-from mudg.stages import annotate, convert
 from mudg.stages.config import AnnotateConfig, ConvertConfig
 from mudg.stages.converting import depthlab as conversion
+from mudg.steps.annotate import Annotate
+from mudg.steps.convert import Convert
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 SAMPLING = DepthLabSampling(processing_px=48, steps=5)
@@ -126,12 +127,12 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
 
 @pytest.mark.slow
 def test_the_command_converts_in_a_process_of_its_own(published: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    to = convert.run(ConvertConfig(), published[0], tmp_path / "out")
+    to = Convert(checkpoint=published[0], to=tmp_path / "out", settings=ConvertConfig()).run()
     assert isinstance(load_depth_network(to), DepthLab)
     (published[0] / "DepthLab" / "mapping_layer.pth").rename(tmp_path / "aside")
     try:
         with pytest.raises(InputError, match="published file is missing"):
-            convert.run(ConvertConfig(), published[0], tmp_path / "other")
+            Convert(checkpoint=published[0], to=tmp_path / "other", settings=ConvertConfig()).run()
     finally:
         (tmp_path / "aside").rename(published[0] / "DepthLab" / "mapping_layer.pth")
 
@@ -140,9 +141,9 @@ def test_flags_that_mean_nothing_for_a_folder_are_refused(tmp_path: Path) -> Non
     (tmp_path / "in").mkdir()
     for config in (ConvertConfig(resolution="320x512"), ConvertConfig(towers="x")):
         with pytest.raises(UsageError, match="do not apply to a DepthLab folder"):
-            convert.run(config, tmp_path / "in", tmp_path / "out")
+            Convert(checkpoint=tmp_path / "in", to=tmp_path / "out", settings=config).run()
     with pytest.raises(InputError, match="a part of DepthLab is missing"):
-        convert.run(ConvertConfig(), tmp_path / "in", tmp_path / "out")
+        Convert(checkpoint=tmp_path / "in", to=tmp_path / "out", settings=ConvertConfig()).run()
     assert not (tmp_path / "out").exists()
 
 
@@ -489,7 +490,7 @@ def test_annotate_reads_a_converted_folder(converted: Path, tmp_path: Path) -> N
     street_ = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0), times=(0.0, 0.1))
     street_.write(tmp_path / "plain", labels=False, width=96, height=48)
     config = AnnotateConfig(depth_network=str(converted), depth_steps=2, processes=1)
-    scene = read_scene(annotate.run(config, tmp_path / "plain", tmp_path / "out"))
+    scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
     for frame in scene.frames:
         depth = read_label(scene, frame, "depth")
         assert depth.shape == (48, 96)

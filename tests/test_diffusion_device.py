@@ -34,10 +34,14 @@ from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM
 from mudg.models.published import files as published_files
 from mudg.models.published.model import WorkSplit
-from mudg.stages import annotate, convert, fuse, learn, synthesize
+from mudg.stages import convert, learn
 from mudg.stages.config import AnnotateConfig, ConvertConfig, FuseConfig, SynthesizeConfig
 from mudg.stages.learning import loading, parallel, precision
 from mudg.stages.learning.models import model_config
+from mudg.steps.annotate import Annotate
+from mudg.steps.fuse import Fuse
+from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Synthesize
 
 NEAR = 1e-4
 """Relative to the largest value: attention sums in another order there. Measured: 1e-7 for the small model, 2e-5 with guidance 7.5."""
@@ -174,7 +178,7 @@ def losses_in(out):
 def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
     """Codec, network, refiner, finisher and scores; stopped after two steps and continued."""
     config = tiny(clips, device="cpu", log_every=1)
-    here = learn.run(config, tmp_path / "here")
+    here = Learn(out=tmp_path / "here", settings=config).run()
     draw = learn.draw_clips
 
     def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
@@ -186,9 +190,9 @@ def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
         there = with_settings(config, device="pretend")
         monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
         with pytest.raises(KeyboardInterrupt):
-            learn.run(there, tmp_path / "there")
+            Learn(out=tmp_path / "there", settings=there).run()
         monkeypatch.setattr(learn, "draw_clips", draw)
-        made = learn.run(there, tmp_path / "there")
+        made = Learn(out=tmp_path / "there", settings=there).run()
     assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
     a, b = (files.load(folder).state_dict() for folder in (here, made))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 2e-3  # kept in 16 bits
@@ -204,9 +208,9 @@ def test_a_published_type_model_learns_on_a_device(tmp_path):
     steady = replace(TINY, net=replace(TINY.net, dropout=0.0))  # dropout draws where it computes
     convert.convert_file(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "model", steady)
     config = published_settings(tmp_path / "model", points, steps=1, batch_frames=4, device="cpu", score_steps=1)
-    here = learn.run(config, tmp_path / "here")
+    here = Learn(out=tmp_path / "here", settings=config).run()
     with pretend_device():
-        there = learn.run(with_settings(config, device="pretend"), tmp_path / "there")
+        there = Learn(out=tmp_path / "there", settings=with_settings(config, device="pretend")).run()
     assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
     a, b = (published_files.load(folder).state_dict() for folder in (here, there))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 1e-3
@@ -219,7 +223,7 @@ def test_a_published_type_model_learns_on_a_device(tmp_path):
 def street(tmp_path_factory):
     root = tmp_path_factory.mktemp("street")
     ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", labels=False, width=WIDTH, height=HEIGHT)
-    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     return root
 
 
@@ -227,13 +231,17 @@ def street(tmp_path_factory):
 def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
     files.save(small, tmp_path / "model", "", {})
     config = SynthesizeConfig(shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1)
-    here = synthesize.run(config, street / "scene", street / "fuse", tmp_path / "here")
+    here = Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "here", settings=config).run()
     with pretend_device():
         elsewhere = replace(config, device="pretend", processes=0)
-        there = synthesize.run(elsewhere, street / "scene", street / "fuse", tmp_path / "there")
+        there = Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "there", settings=elsewhere).run()
         with pytest.raises(UsageError, match="one process makes all trajectories"):
-            synthesize.run(replace(elsewhere, processes=2), street / "scene", street / "fuse", tmp_path / "more")
-        again = synthesize.run(replace(elsewhere, processes=1), street / "scene", street / "fuse", tmp_path / "here")
+            Synthesize(
+                scene=street / "scene", fused=street / "fuse", out=tmp_path / "more", settings=replace(elsewhere, processes=2)
+            ).run()
+        again = Synthesize(
+            scene=street / "scene", fused=street / "fuse", out=tmp_path / "here", settings=replace(elsewhere, processes=1)
+        ).run()
     assert again == here  # where a result was computed is no part of what it is
     for name in ("front_shift+1.0", "front_shift-1.0"):
         a, b = read_observations(here / name), read_observations(there / name)
@@ -250,19 +258,21 @@ def in_float16(folder):
 def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
     config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
     with pytest.raises(UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"):
-        synthesize.run(config, *given, out)
+        Synthesize(scene=given[0], fused=given[1], out=out, settings=config).run()
     with pretend_device(), pytest.raises(UsageError, match="another model on pretend"):
-        synthesize.run(replace(config, model="embedded-tiny", guidance=None, device="pretend"), *given, out)
+        Synthesize(
+            scene=given[0], fused=given[1], out=out, settings=replace(config, model="embedded-tiny", guidance=None, device="pretend")
+        ).run()
     assert not out.exists()
 
 
 @pytest.mark.slow
 def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(street, tmp_path):
     config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
-    here = synthesize.run(replace(config, precision="float32"), *given, tmp_path / "here")
+    here = Synthesize(scene=given[0], fused=given[1], out=tmp_path / "here", settings=replace(config, precision="float32")).run()
     with pretend_device():
         assert loading.load_any(replace(config, device="pretend")).dtype == torch.float16
-        there = synthesize.run(replace(config, device="pretend"), *given, out)
+        there = Synthesize(scene=given[0], fused=given[1], out=out, settings=replace(config, device="pretend")).run()
     a, b = read_observations(here / "front_shift+1.0"), read_observations(there / "front_shift+1.0")
     apart = [float((a[i].rgb - b[i].rgb).abs().mean()) for i in range(5)]
     assert 0 < max(apart) < 0.02  # measured: see the message of a failure
@@ -271,9 +281,11 @@ def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(stre
 @pytest.mark.slow
 def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_path):
     config = AnnotateConfig(device="cpu", processes=1, depth=False)
-    scenes = [read_scene(annotate.run(config, street / "scene", tmp_path / "here"))]
+    scenes = [read_scene(Annotate(scene=street / "scene", out=tmp_path / "here", settings=config).run())]
     with pretend_device(), copies() as crossed:
-        scenes.append(read_scene(annotate.run(replace(config, device="pretend"), street / "scene", tmp_path / "there")))
+        scenes.append(read_scene(Annotate(
+            scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
+        ).run()))
     for one, other in zip(*(scene.frames for scene in scenes), strict=True):
         here, there = (read_label(scene, f, "semantics") for scene, f in zip(scenes, (one, other)))
         assert np.mean(here != there) < 1e-2
@@ -324,9 +336,11 @@ def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
     config = AnnotateConfig(
         labeller="network", weights=str(tmp_path / "net"), depth_network=str(tmp_path / "depth"), device="cpu", processes=1
     )
-    scenes = [read_scene(annotate.run(config, street / "scene", tmp_path / "here"))]
+    scenes = [read_scene(Annotate(scene=street / "scene", out=tmp_path / "here", settings=config).run())]
     with pretend_device():
-        scenes.append(read_scene(annotate.run(replace(config, device="pretend"), street / "scene", tmp_path / "there")))
+        scenes.append(read_scene(Annotate(
+            scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
+        ).run()))
     for one, other in zip(*(scene.frames for scene in scenes), strict=True):
         assert set(one.labels) == set(other.labels)
         classes, depth = (
@@ -342,11 +356,11 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
     for device, error in (("cuda", ResourceError), ("mps:1", ResourceError), ("tpu", UsageError)):
         config = SynthesizeConfig(model=str(tmp_path / "model"), device=device)
         with pytest.raises(error, match="--device"):
-            synthesize.run(config, street / "scene", street / "fuse", tmp_path / "out")
+            Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "out", settings=config).run()
         with pytest.raises(error, match="--device"), parallel.join_processes(device):
             pass
         with pytest.raises(error, match="--device"):
-            annotate.run(AnnotateConfig(device=device), street / "scene", tmp_path / "out")
+            Annotate(scene=street / "scene", out=tmp_path / "out", settings=AnnotateConfig(device=device)).run()
     assert not (tmp_path / "out").exists()
     for name in ("offload", "compiled"):
         with pytest.raises(UsageError, match="published-type models only"):

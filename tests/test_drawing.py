@@ -15,10 +15,13 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.data.city import CityConfig
 from mudg.data.scene import read_scene
 from mudg.models.scene.model import compose
-from mudg.stages import fit, fuse, ingest
+from mudg.stages import fit
 from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
 from mudg.stages.config.fit import AppearanceConfig, DensifyConfig, DrawingConfig, StartConfig
 from mudg.stages.fitting.rendering import NEAR_M, check_drawing, raster_of, rasterize
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 CPU = torch.device("cpu")
@@ -31,15 +34,19 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A scene of three frames and its clouds."""
     root = tmp_path_factory.mktemp("drawing")
     city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",), lidar_azimuth_step_deg=1.0)
-    scene = ingest.run(IngestConfig(city=city, contact_sheet=False, test_every=0), "city", root / "scene")
-    return scene, fuse.run(FuseConfig(), scene, root / "fuse")
+    scene = Ingest(log="city", out=root / "scene", settings=IngestConfig(city=city, contact_sheet=False, test_every=0)).run()
+    return scene, Fuse(scene=scene, out=root / "fuse", settings=FuseConfig()).run()
+
+
+def fitted(config: FitConfig, prepared: tuple[Path, Path], out: Path, start: Path | None = None) -> Path:
+    return Fit(scene=prepared[0], fused=prepared[1], start_from=start, out=out, settings=config).run()
 
 
 @pytest.fixture(scope="module")
 def fits(prepared: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The same few steps, drawn as usual and without added light."""
     root = tmp_path_factory.mktemp("fits")
-    return {name: fit.run(config, *prepared, root / name) for name, config in (("usual", USUAL), ("smooth", SMOOTH))}
+    return {name: fitted(config, prepared, root / name) for name, config in (("usual", USUAL), ("smooth", SMOOTH))}
 
 
 def test_a_model_notes_how_it_was_drawn_if_not_as_usual(fits: dict[str, Path]) -> None:
@@ -60,10 +67,10 @@ def test_renders_draw_as_the_fit_did(fits: dict[str, Path], prepared: tuple[Path
 
 
 def test_a_finished_fit_goes_on_only_as_it_was_drawn(fits: dict[str, Path], prepared: tuple[Path, Path], tmp_path: Path) -> None:
-    out = fit.run(SMOOTH, *prepared, tmp_path / "on", start=fits["smooth"])
+    out = fitted(SMOOTH, prepared, tmp_path / "on", fits["smooth"])
     assert json.loads((out / "model.json").read_text())["facts"]["drawing"] == {"antialias": True}
     with pytest.raises(UsageError, match="drawn with other settings"):
-        fit.run(USUAL, *prepared, tmp_path / "other", start=fits["smooth"])
+        fitted(USUAL, prepared, tmp_path / "other", fits["smooth"])
 
 
 @pytest.mark.parametrize("drawing", [{"primitive": "disc"}, {"projection": "unscented"}, {"packed": True}])
@@ -72,7 +79,7 @@ def test_what_only_gsplat_draws_is_refused_before_anything_is_written(
 ) -> None:
     config = replace(USUAL, drawing=DrawingConfig(**drawing), densify=DensifyConfig(kind="mcmc"))
     with pytest.raises(UsageError, match="only gsplat on a CUDA device"):
-        fit.run(config, *prepared, tmp_path / "out")
+        fitted(config, prepared, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

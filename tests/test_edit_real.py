@@ -11,8 +11,12 @@ from fit_settings import fit_config
 
 from mudg.base import geometry, store
 from mudg.data.scene import check_scene, read_image, read_points, read_scene
-from mudg.stages import annotate, edit, fit, fuse, ingest
 from mudg.stages.config import AnnotateConfig, EditConfig, FuseConfig, IngestConfig
+from mudg.steps.annotate import Annotate
+from mudg.steps.edit import Edit
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 pytestmark = pytest.mark.slow
 LEAD = "0"
@@ -21,18 +25,18 @@ LEAD = "0"
 @pytest.fixture(scope="module")
 def drive(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
-    ingest.run(IngestConfig(resolution="320", contact_sheet=False), shared_data("kitti_2011_09_26"), root / "raw")
-    annotate.run(AnnotateConfig(), root / "raw", root / "scene")  # classes tell what is ground
-    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    Ingest(log=shared_data("kitti_2011_09_26"), out=root / "raw", settings=IngestConfig(resolution="320", contact_sheet=False)).run()
+    Annotate(scene=root / "raw", out=root / "scene", settings=AnnotateConfig()).run()  # classes tell what is ground
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
-    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
     return root
 
 
 @pytest.mark.parametrize("text", [f'- remove: {{ids: ["{LEAD}"]}}', f'- move: {{id: "{LEAD}", along_m: 5, left_m: 1}}'])
 def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str) -> None:
     store.write_text(tmp_path / "e.yaml", text)
-    out = edit.run(EditConfig(), drive, tmp_path / "e.yaml", tmp_path / "out")
+    out = Edit(source=drive, script=tmp_path / "e.yaml", out=tmp_path / "out", settings=EditConfig()).run()
     assert not [finding for finding in check_scene(out / "scene") if finding.level == "error"]
     old, new = read_scene(drive / "scene"), read_scene(out / "scene")
     for a, b in zip(old.frames, new.frames, strict=True):

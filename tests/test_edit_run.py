@@ -23,11 +23,15 @@ from mudg.data.cloudfile import read_fused, write_fused
 from mudg.data.edits import parse_edits
 from mudg.data.observations import read_observations
 from mudg.data.scene import check_scene, read_image, read_label, read_points, read_scene
-from mudg.stages import edit, fit, fuse, render
+from mudg.stages import edit
 from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, RenderConfig
 from mudg.stages.editing.apply import left_behind
 from mudg.stages.editing.carried import EditedDrive, carry_out
 from mudg.stages.fitting.storage import load_model
+from mudg.steps.edit import Edit
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.render import RenderViews
 
 FRAMES = 4
 LAST_S = 0.3 * (FRAMES - 1)
@@ -40,7 +44,7 @@ def run(tmp_path_factory) -> Path:
     write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
     write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
     config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
-    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
     return root
 
 
@@ -55,13 +59,13 @@ def images(folder: Path, name: str = "front_recorded") -> list[torch.Tensor]:
 
 
 def rendered(scene: Path, model: Path, out: Path, edits: Path | None = None) -> list[torch.Tensor]:
-    return images(render.run(RenderConfig(shifts_m=(0.0,), video=False), scene, model, out, edits=edits))
+    return images(RenderViews(scene=scene, model=model, edits=edits, out=out, settings=RenderConfig(shifts_m=(0.0,), video=False)).run())
 
 
 def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Path) -> None:
     text = "- move: {id: car, left_m: 1.5, along_m: 1}\n- lane_change: {id: ego, left_m: 0.4, start_s: 0, duration_s: 0.8, ground: false}"
     edits, model = script(tmp_path, text), run / "fit" / "street_gaussians"
-    made = edit.run(EditConfig(), model, edits, tmp_path / "edited", scene=run / "scene")
+    made = Edit(source=model, script=edits, scene=run / "scene", out=tmp_path / "edited", settings=EditConfig()).run()
     before = rendered(run / "scene", model, tmp_path / "a")
     after = rendered(run / "scene", made, tmp_path / "b")
     on_the_way = rendered(run / "scene", model, tmp_path / "c", edits)
@@ -83,10 +87,16 @@ def test_renders_show_weather_and_light(run: Path, tmp_path: Path) -> None:
     way show the same."""
     edits, model = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
     config = RenderConfig(shifts_m=(0.0,), video=False)
-    plain = read_observations(render.run(config, run / "scene", model, tmp_path / "plain") / "front_recorded")[1]
-    foggy = read_observations(render.run(config, run / "scene", model, tmp_path / "foggy", edits=edits) / "front_recorded")[1]
-    made = edit.run(EditConfig(), model, edits, tmp_path / "edited", scene=run / "scene")
-    again = read_observations(render.run(config, run / "scene", made, tmp_path / "again") / "front_recorded")[1]
+    plain = read_observations(RenderViews(
+        scene=run / "scene", model=model, out=tmp_path / "plain", settings=config
+    ).run() / "front_recorded")[1]
+    foggy = read_observations(RenderViews(
+        scene=run / "scene", model=model, edits=edits, out=tmp_path / "foggy", settings=config
+    ).run() / "front_recorded")[1]
+    made = Edit(source=model, script=edits, scene=run / "scene", out=tmp_path / "edited", settings=EditConfig()).run()
+    again = read_observations(RenderViews(
+        scene=run / "scene", model=made, out=tmp_path / "again", settings=config
+    ).run() / "front_recorded")[1]
     assert torch.equal(foggy.rgb, again.rgb) and not torch.equal(foggy.rgb, plain.rgb)
     assert torch.equal(foggy.depth.nan_to_num(), plain.depth.nan_to_num()) and torch.equal(foggy.semantics, plain.semantics)
     solid = torch.isfinite(plain.depth[0]) & (plain.depth[0] > 0)
@@ -98,7 +108,7 @@ def test_renders_show_weather_and_light(run: Path, tmp_path: Path) -> None:
 
 def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
     edits = script(tmp_path, "- move: {id: car, along_m: 1, ground: false}")
-    out = edit.run(EditConfig(), run, edits, tmp_path / "edited")
+    out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=EditConfig()).run()
     old, new = read_scene(run / "scene"), read_scene(out / "scene")
     assert not [finding for finding in check_scene(out / "scene") if finding.level == "error"]
     step = geometry.yaw_matrix(0.0, (1.0, 0, 0))
@@ -122,10 +132,12 @@ def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
     assert became["cleared"] > 0 and became["on_objects"] > 0
     assert became["cleared"] + became["hidden"] >= became["on_objects"]
     assert len(rendered(out / "scene", out / "fit" / "street_gaussians", tmp_path / "render")) == FRAMES
-    fused = read_fused(fuse.run(FuseConfig(), out / "scene", tmp_path / "fused"))
+    fused = read_fused(Fuse(scene=out / "scene", out=tmp_path / "fused", settings=FuseConfig()).run())
     assert "car" in fused.objects
     assert read_fused(out / "fuse").objects.keys() == {"car"}
-    again = edit.run(EditConfig(), out, script(tmp_path, "- remove: {ids: [car]}", "more.yaml"), tmp_path / "twice")
+    again = Edit(
+        source=out, script=script(tmp_path, "- remove: {ids: [car]}", "more.yaml"), out=tmp_path / "twice", settings=EditConfig()
+    ).run()
     assert read_scene(again / "scene").tracks == ()
     assert read_fused(again / "fuse").objects == {}
 
@@ -133,7 +145,9 @@ def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
 def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(run: Path, tmp_path: Path, capsys) -> None:
     """Fog takes returns of far surfaces and adds some of its own, nearer than what stands there, on beams of the recording."""
     log.set_quiet(False)
-    out = edit.run(EditConfig(), run, script(tmp_path, "- weather: {fog: {visibility_m: 12}}"), tmp_path / "foggy")
+    out = Edit(
+        source=run, script=script(tmp_path, "- weather: {fog: {visibility_m: 12}}"), out=tmp_path / "foggy", settings=EditConfig()
+    ).run()
     assert "LiDAR sweeps are in fog and rain" in capsys.readouterr().err
     old, new = read_scene(run / "scene"), read_scene(out / "scene")
     for a, b in zip(old.frames, new.frames, strict=True):
@@ -154,7 +168,7 @@ def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(run: Path
 
 def test_the_vehicle_of_a_run_changes_lanes(run: Path, tmp_path: Path) -> None:
     edits = script(tmp_path, "- lane_change: {id: ego, left_m: 0.5, start_s: 0, duration_s: 0.9}")
-    out = edit.run(EditConfig(), run, edits, tmp_path / "edited")
+    out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=EditConfig()).run()
     new = read_scene(out / "scene")
     assert (geometry.invert(ego_pose(LAST_S)) @ new.ego.pose_at(LAST_S))[1, 3] == pytest.approx(0.5, abs=0.02)
     again = rendered(out / "scene", out / "fit" / "street_gaussians", tmp_path / "render")
@@ -167,14 +181,14 @@ def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
     for text in ("- mve: {id: car}", "- move: {id: nobody}", "- lane_change: {id: car, left_m: 9, start_s: 0, duration_s: 0.2}"):
         edits = script(tmp_path, text)
         with pytest.raises(InputError, match="line 1"):
-            edit.run(EditConfig(), model, edits, out)
+            Edit(source=model, script=edits, out=out, settings=EditConfig()).run()
         with pytest.raises(InputError, match="line 1"):
             rendered(run / "scene", model, out, edits)
         assert not out.exists()
     with pytest.raises(UsageError, match="input"):
-        edit.run(EditConfig(), run, script(tmp_path, "- remove: {ids: [car]}"), run / "edited")
+        Edit(source=run, script=script(tmp_path, "- remove: {ids: [car]}"), out=run / "edited", settings=EditConfig()).run()
     with pytest.raises(InputError, match="no fitted scene"):
-        edit.run(EditConfig(), run / "scene", tmp_path / "edits.yaml", out)
+        Edit(source=run / "scene", script=tmp_path / "edits.yaml", out=out, settings=EditConfig()).run()
     assert not out.exists()
 
 
@@ -187,17 +201,17 @@ def test_results_are_reused_refused_and_resumed(run: Path, tmp_path: Path, monke
     with monkeypatch.context() as patch:
         patch.setattr(edit, "write_edited_scene", stop)
         with pytest.raises(KeyboardInterrupt):
-            edit.run(EditConfig(), run, edits, out)
+            Edit(source=run, script=edits, out=out, settings=EditConfig()).run()
     assert (out / "fuse" / "fuse.json").is_file()
-    edit.run(EditConfig(), run, edits, out)
-    whole = edit.run(EditConfig(), run, edits, tmp_path / "whole")
+    Edit(source=run, script=edits, out=out, settings=EditConfig()).run()
+    whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
     assert store.digest(out) == store.digest(whole)
     stamp = (out / "edit.json").stat().st_mtime_ns
-    edit.run(EditConfig(), run, script(tmp_path, "# the same\n- remove: {class: car}"), out)
+    Edit(source=run, script=script(tmp_path, "# the same\n- remove: {class: car}"), out=out, settings=EditConfig()).run()
     assert (out / "edit.json").stat().st_mtime_ns == stamp
     with pytest.raises(UsageError, match="another configuration"):
-        edit.run(EditConfig(), run, script(tmp_path, "- stop: {id: car, at_s: 0.2}"), out)
-    edit.run(EditConfig(), run, tmp_path / "edits.yaml", out, overwrite=True)
+        Edit(source=run, script=script(tmp_path, "- stop: {id: car, at_s: 0.2}"), out=out, settings=EditConfig()).run()
+    Edit(source=run, script=tmp_path / "edits.yaml", out=out, overwrite=True, settings=EditConfig()).run()
     assert store.read_json(out / "edit.json")["changed"] == ["car"]
 
 
@@ -229,17 +243,20 @@ def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
     """Its own street put in again changes nothing but the sky's texels."""
     model = run / "fit" / "street_gaussians"
     edits = script(tmp_path, f"- background: {{run: {run}}}")
-    made = edit.run(EditConfig(), model, edits, tmp_path / "out", scene=run / "scene", fused=run / "fuse")
+    made = Edit(source=model, script=edits, scene=run / "scene", fused=run / "fuse", out=tmp_path / "out", settings=EditConfig()).run()
     before, after = (rendered(run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b")))
     for one, two in zip(before, after, strict=True):
         assert (one - two).abs().mean() < 0.01
-    whole = edit.run(EditConfig(), run, edits, tmp_path / "whole")
+    whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
     scene = read_scene(whole / "scene")
     assert not [finding for finding in check_scene(whole / "scene") if finding.level == "error"]
     assert scene.sweeps == () and len(scene.frames) == len(read_scene(run / "scene").frames)
     old, new = (read_fused(folder / "fuse") for folder in (run, whole))
     assert np.abs(old.static.xyz - new.static.xyz).max() < 1e-3 and new.objects.keys() == old.objects.keys()
-    alone = edit.run(EditConfig(), model, script(tmp_path, f"- background: {{run: {model}}}"), tmp_path / "fit", scene=run / "scene")
+    alone = Edit(
+        source=model, script=script(tmp_path, f"- background: {{run: {model}}}"), scene=run / "scene", out=tmp_path / "fit",
+        settings=EditConfig(),
+    ).run()  # fmt: skip
     assert (alone / "model.json").is_file()  # a fit knows its scene, and with it where its street lies
 
 

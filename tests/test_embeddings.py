@@ -18,9 +18,9 @@ from mudg.base.types import Observation
 from mudg.core import feature_distances
 from mudg.models import clip_image, dinov2
 from mudg.pages import score_tables
-from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring.embeddings import subject_consistency
+from mudg.steps.score import Score
 
 
 def images(count: int, side: int, seed: int = 0) -> torch.Tensor:
@@ -193,7 +193,7 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
         dino_weights=str(tmp_path / "dino.safetensors"), clip_weights=str(tmp_path / "clip.safetensors"),
         video_features=str(tmp_path / "video"), perceptual_views=0, error_pictures=False,
     )  # fmt: skip
-    out = score.run(config, scene, methods, tmp_path / "score")
+    out = Score(scene=scene, views=methods, out=tmp_path / "score", settings=config).run()
     document = store.read_json(out / "metrics.json")
     values = {r["method"]: r["values"] for r in document["results"]}
     assert values["a"]["fd_dinov2"] == pytest.approx(0, abs=1e-4)  # the toy's views are its recorded images
@@ -226,7 +226,9 @@ def test_programs_are_not_read_as_video_features(tmp_path: Path) -> None:
     program = tmp_path / "extractor.pt"
     program.write_bytes(b"PK")
     with pytest.raises(InputError, match="no such folder of features"):
-        score.run(ScoreConfig(video_features=str(program), perceptual_views=0), scene, {"a": views}, tmp_path / "score")
+        Score(
+            scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(video_features=str(program), perceptual_views=0)
+        ).run()
 
 
 def test_malformed_video_features_are_refused(tmp_path: Path) -> None:
@@ -235,4 +237,4 @@ def test_malformed_video_features_are_refused(tmp_path: Path) -> None:
     store.write_safetensors(tmp_path / "video" / "recorded" / "front.safetensors", {"features": np.zeros((3, 2, 2), np.float32)})
     config = ScoreConfig(video_features=str(tmp_path / "video"), perceptual_views=0)
     with pytest.raises(InputError, match=r"front.safetensors"):
-        score.run(config, scene, {"a": views}, tmp_path / "score")
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()

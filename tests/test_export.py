@@ -40,9 +40,11 @@ from mudg.stages.editing.assets import read_asset
 from mudg.stages.editing.carried import background_of
 from mudg.stages.editing.plan import EditWorld, place_background
 from mudg.stages.editing.runs import find_run
-from mudg.stages.exporting import export, imports, scenes
+from mudg.stages.exporting import export, scenes
 from mudg.stages.fit import render_view
 from mudg.stages.fitting.storage import load_model, save_model
+from mudg.steps.asset import AssetImport
+from mudg.steps.export import Export
 
 LEAST_DB = {"ply": 50, "glb": 50, "usda": 50, "spz": 38, "compressed-ply": 38, "sog": 38, "splat": 30}
 T = 0.5
@@ -181,22 +183,22 @@ def test_the_verb_writes_a_file_and_what_it_is(fit: Path, tmp_path: Path, capsys
 
 
 def test_nodes_edits_and_motion(fit: Path, tmp_path: Path) -> None:
-    export.run(ExportConfig(nodes=("car-1",)), "usda", fit, tmp_path / "car.usda")
+    Export(format="usda", source=fit, out=tmp_path / "car.usda", settings=ExportConfig(nodes=("car-1",))).run()
     stage = slow.parse_usda((tmp_path / "car.usda").read_text())["World"]
     assert list(stage) == ["type", "car_1"] and len(stage["car_1"]["xformOp:translate"]) == 21
     script = tmp_path / "edits.yaml"
     script.write_text("- move: {id: car-1, left_m: 2, ground: false}\n")
-    export.run(ExportConfig(time_s=T), "ply", fit, tmp_path / "moved.ply", edits=script)
-    export.run(ExportConfig(time_s=T), "ply", fit, tmp_path / "plain.ply")
+    Export(format="ply", source=fit, edits=script, out=tmp_path / "moved.ply", settings=ExportConfig(time_s=T)).run()
+    Export(format="ply", source=fit, out=tmp_path / "plain.ply", settings=ExportConfig(time_s=T)).run()
     moved, plain = (
         formats.read_cloud((tmp_path / f"{n}.ply").read_bytes(), "x.ply")[0].means for n in ("moved", "plain")
     )
     apart = np.linalg.norm(moved - plain, axis=1)
     assert not apart[:640].any() and np.abs(apart[640:] - 2).max() < 1e-4
-    export.run(ExportConfig(sky="sphere"), "glb", fit, tmp_path / "a.glb")
+    Export(format="glb", source=fit, out=tmp_path / "a.glb", settings=ExportConfig(sky="sphere")).run()
     document, _ = slow.open_glb((tmp_path / "a.glb").read_bytes())
     assert [node["name"] for node in document["nodes"]] == ["background", "car-1", "sky"]
-    export.run(ExportConfig(), "bundle", fit, tmp_path / "a.zip")
+    Export(format="bundle", source=fit, out=tmp_path / "a.zip", settings=ExportConfig()).run()
     assert "sky.png" in zipfile.ZipFile(tmp_path / "a.zip").namelist()
 
 
@@ -218,13 +220,13 @@ def test_what_cannot_be_exported_is_refused(
     fit: Path, tmp_path: Path, settings: dict, name: str, out: str, said: str
 ) -> None:
     with pytest.raises(MudgError, match=said):
-        export.run(ExportConfig(**settings), name, fit, tmp_path / out)
+        Export(format=name, source=fit, out=tmp_path / out, settings=ExportConfig(**settings)).run()
     assert not (tmp_path / out).exists()
 
 
 def test_an_output_inside_the_fit_is_refused(fit: Path) -> None:
     with pytest.raises(UsageError, match="lies in"):
-        export.run(ExportConfig(), "ply", fit, fit / "a.ply")
+        Export(format="ply", source=fit, out=fit / "a.ply", settings=ExportConfig()).run()
 
 
 # -- imports -------------------------------------------------------------------------------------------------------------
@@ -250,14 +252,14 @@ def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_
     assert abs(np.ptp(means[:, 0]) / np.ptp(car.means[:, 1]) - scale) < 0.02 * scale  # what lay along y lies along x
     script = tmp_path / "edits.yaml"
     script.write_text("- insert: {asset: {file: a.safetensors}, id: van-9, path: [[0, 9, 2, 0]]}\n")
-    export.run(ExportConfig(time_s=T, nodes=("van-9",)), "ply", fit, tmp_path / "inserted.ply", edits=script)
+    Export(format="ply", source=fit, edits=script, out=tmp_path / "inserted.ply", settings=ExportConfig(time_s=T, nodes=("van-9",))).run()
     assert (tmp_path / "inserted.ply").is_file()
 
 
 def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
     cloud = toy_splats.cloud(40, 2, classes=True)
     (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud, classes=True))
-    imports.run(ImportConfig(kind="scene", axes="world"), tmp_path / "a.ply", tmp_path / "fit")
+    AssetImport(file=tmp_path / "a.ply", out=tmp_path / "fit", settings=ImportConfig(kind="scene", axes="world")).run()
     model = load_model(tmp_path / "fit")
     assert len(model.table) == 40 and model.sh_degree == 2 and model.nodes[0].kind == "static"
     again = scenes.splat_scene(model, 0.0).nodes[0].cloud
@@ -267,7 +269,7 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
         and np.array_equal(again.class_ids, cloud.class_ids)
     )
     with pytest.raises(UsageError, match="settings of objects"):
-        imports.run(ImportConfig(kind="scene", label="car"), tmp_path / "a.ply", tmp_path / "fit2")
+        AssetImport(file=tmp_path / "a.ply", out=tmp_path / "fit2", settings=ImportConfig(kind="scene", label="car")).run()
 
 
 def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
@@ -277,7 +279,9 @@ def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> Non
     means = np.concatenate([ground, wall]).astype(np.float32)
     cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
     (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
-    imports.run(ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0)), tmp_path / "a.ply", tmp_path / "street")
+    AssetImport(
+        file=tmp_path / "a.ply", out=tmp_path / "street", settings=ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0))
+    ).run()
     found = background_of(find_run(tmp_path / "street"), "street")
     assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
     pose = geometry.yaw_matrix(0.5, (20, 5, 1))
@@ -290,17 +294,17 @@ def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> Non
 
 def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="file not found"):
-        imports.run(ImportConfig(), tmp_path / "no.ply", tmp_path / "a.safetensors")
+        AssetImport(file=tmp_path / "no.ply", out=tmp_path / "a.safetensors", settings=ImportConfig()).run()
     (tmp_path / "a.obj").write_bytes(b"v 0 0 0")
     with pytest.raises(InputError, match="no file of Gaussians"):
-        imports.run(ImportConfig(), tmp_path / "a.obj", tmp_path / "a.safetensors")
+        AssetImport(file=tmp_path / "a.obj", out=tmp_path / "a.safetensors", settings=ImportConfig()).run()
     (tmp_path / "b.ply").write_bytes(
         formats.ply.to_bytes(replace(toy_splats.cloud(5), logits=np.full(5, -9, np.float32)))
     )
     with pytest.raises(InputError, match="no solid Gaussians"):
-        imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.safetensors")
+        AssetImport(file=tmp_path / "b.ply", out=tmp_path / "a.safetensors", settings=ImportConfig()).run()
     with pytest.raises(UsageError, match="ends in .safetensors"):
-        imports.run(ImportConfig(), tmp_path / "b.ply", tmp_path / "a.ply")
+        AssetImport(file=tmp_path / "b.ply", out=tmp_path / "a.ply", settings=ImportConfig()).run()
     assert (
         app.main(["asset", "import", str(tmp_path / "b.ply"), "car-1", "--out", str(tmp_path / "a.safetensors")]) == 2
     )
@@ -313,7 +317,7 @@ def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
 
 def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
     scene = ToyStreet(times=[0.0, 0.1]).write(tmp_path / "scene", width=24, height=12)
-    export.run(ExportConfig(), "nerfstudio", tmp_path / "scene", tmp_path / "out")
+    Export(format="nerfstudio", source=tmp_path / "scene", out=tmp_path / "out", settings=ExportConfig()).run()
     told = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert len(told["frames"]) == 2
     for frame, ours in zip(told["frames"], scene.frames, strict=True):
@@ -325,7 +329,7 @@ def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
         x, y, z, _ = np.linalg.inv(pose) @ point  # x right, y up, z back
         uv = frame["fl_x"] * x / -z + frame["cx"], frame["fl_y"] * -y / -z + frame["cy"]
         assert np.allclose(uv, geometry.project(ours.view, point[None, :3])[0][0])
-    again = export.run(ExportConfig(), "nerfstudio", tmp_path / "scene", tmp_path / "out")
+    again = Export(format="nerfstudio", source=tmp_path / "scene", out=tmp_path / "out", settings=ExportConfig()).run()
     assert again == tmp_path / "out"  # verified and reused
 
 

@@ -27,6 +27,7 @@ from mudg.data.scene.files import open_files
 from mudg.stages.config import ExportConfig
 from mudg.stages.exporting import export
 from mudg.stages.fitting.storage import save_model
+from mudg.steps.export import Export
 
 
 class CdrReader:
@@ -253,12 +254,12 @@ def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
     save_model(toy(), tmp_path / "fit")
     for name, out in (("ros2", "bag"), ("mcap", "a.mcap")):
         with pytest.raises(MudgError, match="none is known here"):
-            export.run(ExportConfig(), name, tmp_path / "fit", tmp_path / out)
+            Export(format=name, source=tmp_path / "fit", out=tmp_path / out, settings=ExportConfig()).run()
         assert not (tmp_path / out).exists()
     scene = street(tmp_path / "scene")
     (tmp_path / "scene" / scene.frames[1].image.path).unlink()
     with pytest.raises(MudgError):
-        export.run(ExportConfig(), "ros2", tmp_path / "scene", tmp_path / "bag")
+        Export(format="ros2", source=tmp_path / "scene", out=tmp_path / "bag", settings=ExportConfig()).run()
     assert not (tmp_path / "bag" / "metadata.yaml").exists() and not (tmp_path / "bag" / "log_0.mcap").exists()
 
 
@@ -269,7 +270,7 @@ def test_rerun_names_its_extra_where_it_is_missing(tmp_path: Path, monkeypatch: 
     monkeypatch.setitem(sys.modules, "rerun", None)
     save_model(toy(), tmp_path / "fit")
     with pytest.raises(ResourceError, match=r"mudg\[rerun\]"):
-        export.run(ExportConfig(), "rerun", tmp_path / "fit", tmp_path / "a.rrd")
+        Export(format="rerun", source=tmp_path / "fit", out=tmp_path / "a.rrd", settings=ExportConfig()).run()
     assert not (tmp_path / "a.rrd").exists()
     assert app.main(["export", "rerun", str(tmp_path / "fit"), "--out", str(tmp_path / "a.mcap")]) != 0
 
@@ -280,7 +281,7 @@ def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
 
     scene = street(tmp_path / "scene")
     save_model(toy(), tmp_path / "fit")
-    export.run(ExportConfig(), "rerun", tmp_path / "fit", tmp_path / "a.rrd", scene=tmp_path / "scene")
+    Export(format="rerun", source=tmp_path / "fit", scene=tmp_path / "scene", out=tmp_path / "a.rrd", settings=ExportConfig()).run()
     columns: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks():
         batch = chunk.to_record_batch()

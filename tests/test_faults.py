@@ -22,7 +22,7 @@ from mudg.base import store
 from mudg.base.errors import ResourceError
 from mudg.base.replacement import Replacement
 from mudg.base.run_folder import RunDir, VerbOutput
-from mudg.stages import learn
+from mudg.steps.learn import Learn
 
 OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))
 SWEPT = [name for name in VERBS if name not in ("learn", "bench", "film")]
@@ -196,7 +196,7 @@ def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dic
 def small_training(clips: Path, out: Path) -> Path:
     """``mudg learn`` in a moment: codec, steps, checkpoints, scores, model; stops on SIGTERM as the command does."""
     with app._sigterm_interrupts():
-        return learn.run(tiny(clips), out)
+        return Learn(out=out, settings=tiny(clips)).run()
 
 
 @pytest.fixture(scope="module")

@@ -35,6 +35,7 @@ from mudg.stages.fitting import start as fit_start
 from mudg.stages.fitting import trust as fit_trust
 from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.finite import FiniteCheck
+from mudg.steps.fit import Fit
 
 SIZE = (60, 40)
 FRAMES = 6
@@ -75,12 +76,14 @@ def mean_psnr(folder: Path, left_m: float = 0.0) -> float:
 @pytest.fixture(scope="module")
 def learnt(world, tmp_path_factory) -> Path:
     """What 150 steps give."""
-    return fit.run(settings(iterations=150), world["scene"], world["fuse"], tmp_path_factory.mktemp("learnt") / "fit")
+    return Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path_factory.mktemp("learnt") / "fit", settings=settings(iterations=150)
+    ).run()
 
 
 def test_it_learns(world, learnt, tmp_path):
     """Some 150 steps from round grey blobs must clearly beat the start, in colour, depth and semantics."""
-    start, end = fit.run(settings(iterations=1), world["scene"], world["fuse"], tmp_path / "start"), learnt
+    start, end = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)).run(), learnt
     assert mean_psnr(end) > mean_psnr(start) + 5.0
     assert mean_psnr(end) > 21.0
     view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
@@ -106,10 +109,10 @@ def test_the_moving_car_is_where_its_track_says(learnt):
 
 
 def test_same_in_same_out(world, tmp_path):
-    first = fit.run(settings(iterations=12), world["scene"], world["fuse"], tmp_path / "a")
-    second = fit.run(settings(iterations=12), world["scene"], world["fuse"], tmp_path / "b")
+    first = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "a", settings=settings(iterations=12)).run()
+    second = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "b", settings=settings(iterations=12)).run()
     assert fitted_bytes(first) == fitted_bytes(second)
-    other = fit.run(settings(iterations=12, seed=1), world["scene"], world["fuse"], tmp_path / "c")
+    other = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "c", settings=settings(iterations=12, seed=1)).run()
     assert fitted_bytes(other) != fitted_bytes(first)
 
 
@@ -124,8 +127,8 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
         assert [step for step in range(1, 27) if schedule.reset_due(step)] == [12]
     assert [step for step in range(1, 27) if schedule.due(step)] == ([10] if densify == "gradient" else [10, 20])
     assert config.virtual.start * config.iterations == pytest.approx(3.9)
-    arguments = (config, world["scene"], world["fuse"])
-    whole = fit.run(*arguments, tmp_path / "whole", observations=world["virtual"])
+    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole", settings=config)
+    whole = step.run()
 
     adam_step, parts = fit.adam_step, tmp_path / "parts"
 
@@ -137,17 +140,17 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     monkeypatch.setattr(fit, "adam_step", ctrl_c)
     while stops:
         with pytest.raises(KeyboardInterrupt):
-            fit.run(*arguments, parts, observations=world["virtual"])
+            replace(step, out=parts).run()
         assert (parts / "steps" / f"step_{stops.pop(0):08d}").is_dir()
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    assert fitted_bytes(fit.run(*arguments, parts, observations=world["virtual"])) == fitted_bytes(whole)
+    assert fitted_bytes(replace(step, out=parts).run()) == fitted_bytes(whole)
 
 
 @pytest.mark.parametrize("densify", ["gradient", "mcmc", "none"])
 def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
     """Row counts kept between densifications, and any number of threads: the same bytes."""
     config = settings(iterations=22, densify__kind=densify)
-    first = fit.run(config, world["scene"], world["fuse"], tmp_path / "a")
+    first = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "a", settings=config).run()
 
     def counted_again(model):
         return torch.bincount(model.table.labels["node"].long(), minlength=len(model.nodes)).tolist()
@@ -157,7 +160,7 @@ def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_
     native.set_threads(3) if native.library() is not None else None
     torch.set_num_threads(2)
     try:
-        second = fit.run(config, world["scene"], world["fuse"], tmp_path / "b")
+        second = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "b", settings=config).run()
         assert torch.get_num_threads() == 2
     finally:
         native.set_threads(before) if native.library() is not None else None
@@ -166,9 +169,13 @@ def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_
 
 def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_path):
     configs = {kind: settings(iterations=44, densify__max_gaussians=1600, densify__kind=kind) for kind in ("gradient", "mcmc", "none")}
-    made = {kind: fit.run(config, world["scene"], world["fuse"], tmp_path / kind) for kind, config in configs.items()}
+    made = {kind: Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path / kind, settings=config
+    ).run() for kind, config in configs.items()}
     rows = {kind: len(fit.load_model(folder).table) for kind, folder in made.items()}
-    start = len(fit.load_model(fit.run(settings(iterations=1), world["scene"], world["fuse"], tmp_path / "start")).table)
+    start = len(fit.load_model(Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)
+    ).run()).table)
     assert rows["none"] == start
     assert start < rows["mcmc"] <= 1600
     assert start < rows["gradient"] <= 1600
@@ -195,7 +202,9 @@ def test_regularisers_are_means_of_opacity_and_scale():
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):
-    folder = fit.run(settings(iterations=60, densify__max_gaussians=1600), world["scene"], world["fuse"], tmp_path / "fit")
+    folder = Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=60, densify__max_gaussians=1600)
+    ).run()
     rows = [line["rows"] for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99) if "rows" in line]
     assert max(rows) > 1500
     assert max(rows) <= 1600
@@ -213,15 +222,19 @@ def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
 
     monkeypatch.setattr(fit, "rasterize", spy)
     monkeypatch.setattr(fit.DensifyStats, "observe", observe)
-    fit.run(settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999), world["scene"], world["fuse"],
-            tmp_path / "fit", observations=world["virtual"])  # fmt: skip
+    Fit(
+        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "fit",
+        settings=settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999),
+    ).run()  # fmt: skip
     assert {absgrad for width, absgrad in kinds if width == 30} == {False}
     assert any(absgrad for width, absgrad in kinds if width == SIZE[0])
 
 
 def test_perfect_virtual_views_help_off_the_path(world, learnt, tmp_path):
     config = settings("mudg_s", iterations=150, virtual__probability=0.4)
-    guided = fit.run(config, world["scene"], world["fuse"], tmp_path / "guided", observations=world["virtual"])
+    guided = Fit(
+        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "guided", settings=config
+    ).run()
     assert mean_psnr(guided, left_m=2.0) > mean_psnr(learnt, left_m=2.0) + 0.3
 
 
@@ -241,7 +254,7 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
     monkeypatch.setattr(fit, "adam_step", lambda model, step, *rest: (stepped.append(step), adam_step(model, step, *rest)))
     monkeypatch.setattr(fit.losses, "sky_map", poisoned)
     with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/00000\d, step 5"):
-        fit.run(settings(), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings()).run()
     assert stepped == [1, 2, 3, 4]
 
 
@@ -268,10 +281,12 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, 
 
 def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
     with pytest.raises(UsageError, match="virtual observations"):
-        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings("mudg_s")).run()
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no finished virtual views"):
-        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "empty")
+        Fit(
+            scene=world["scene"], fused=world["fuse"], observations=(tmp_path / "empty",), out=tmp_path / "fit", settings=settings("mudg_s")
+        ).run()
 
 
 def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_path):
@@ -279,12 +294,13 @@ def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_pa
     for name in names:
         shutil.copytree(world["virtual"] / name, tmp_path / f"of {name}" / name)
     several = [tmp_path / f"of {name}" if number else world["virtual"] / name for number, name in enumerate(names)]
-    arguments = (settings("mudg_s", iterations=4, virtual__start=0.0), world["scene"], world["fuse"])
-    together = fit.run(*arguments, tmp_path / "together", observations=world["virtual"])
-    apart = fit.run(*arguments, tmp_path / "apart", observations=several)
+    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole",
+               settings=settings("mudg_s", iterations=4, virtual__start=0.0))  # fmt: skip
+    together = replace(step, out=tmp_path / "together").run()
+    apart = replace(step, out=tmp_path / "apart", observations=tuple(several)).run()
     assert fitted_bytes(apart) == fitted_bytes(together)
     with pytest.raises(InputError, match=r"same name[\s\S]*front_shift"):
-        fit.run(*arguments, tmp_path / "twice", observations=[world["virtual"], several[0]])
+        replace(step, out=tmp_path / "twice", observations=(world["virtual"], several[0])).run()
     assert len(names) > 1
     assert not (tmp_path / "twice").exists()
 
@@ -298,7 +314,9 @@ def test_a_generated_view_of_which_no_pixel_counts_is_no_number(world, tmp_path)
         "mudg_s", iterations=2, virtual__probability=1.0, virtual__start=0.0, virtual__stop=1.0, virtual__beside=False,
         virtual__gaussians=0,
     )  # fmt: skip
-    folder = fit.run(config, world["scene"], world["fuse"], tmp_path / "fit", observations=tmp_path / "virtual")
+    folder = Fit(
+        scene=world["scene"], fused=world["fuse"], observations=(tmp_path / "virtual",), out=tmp_path / "fit", settings=config
+    ).run()
     last = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()][-1]
     assert last["view"].startswith("front_shift") and "psnr" not in last and "loss_virtual_color" in last
 
@@ -311,20 +329,20 @@ def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
     with ObservationWriter(sets / "front_recorded", "front_recorded", "truth", "recorded") as writer:
         writer.add(replace(truth(view), kind="recorded"))
     with pytest.raises(InputError, match=r"recorded views[\s\S]*front_recorded[\s\S]*mudg synthesize"):
-        fit.run(settings("mudg_s"), world["scene"], world["fuse"], tmp_path / "fit", observations=sets)
+        Fit(scene=world["scene"], fused=world["fuse"], observations=(sets,), out=tmp_path / "fit", settings=settings("mudg_s")).run()
     assert not (tmp_path / "fit").exists()
 
 
 def test_another_configuration_in_the_same_folder_is_refused(world, tmp_path):
-    fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit")
-    assert fit.run(settings(iterations=2), world["scene"], world["fuse"], tmp_path / "fit") == tmp_path / "fit"
+    Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=2)).run()
+    assert Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=2)).run() == tmp_path / "fit"
     with pytest.raises(UsageError, match="another configuration"):
-        fit.run(settings(iterations=3), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=3)).run()
 
 
 def test_unknown_camera_and_no_fit(world, tmp_path):
     with pytest.raises(UsageError, match="no camera named 'rear'"):
-        fit.run(settings(cameras=("rear",)), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(cameras=("rear",))).run()
     with pytest.raises(InputError, match="no fitted scene"):
         fit.load_model(tmp_path)
 
@@ -337,7 +355,7 @@ def test_scenes_without_tracks_or_labels_or_with_one_frame_work(tmp_path, method
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     cloud = fused_cloud(1, semantics=False)
     write_fused(tmp_path / "fuse", type(cloud)(cloud.static, {}), {})
-    folder = fit.run(settings(method, iterations=60), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit")
+    folder = Fit(scene=tmp_path / "scene", fused=tmp_path / "fuse", out=tmp_path / "fit", settings=settings(method, iterations=60)).run()
     model, view = fit.load_model(folder), view_at(0.0, camera(width=SIZE[0], height=SIZE[1]))
     seen, exact = fit.render_view(model, view, RasterConfig()), truth(view)
     assert seen.semantics is None
@@ -381,8 +399,10 @@ def test_fused_points_give_depth_beside_the_path(world):
 def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path):
     usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [
-        fit.run(replace(usual, virtual=replace(usual.virtual, **changes)), world["scene"], world["fuse"], tmp_path / str(n),
-                observations=world["virtual"])
+        Fit(
+            scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / str(n),
+            settings=replace(usual, virtual=replace(usual.virtual, **changes)),
+        ).run()  # fmt: skip
         for n, changes in enumerate(({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0}, {"densify": True}))
     ]  # fmt: skip
     assert len({fitted_bytes(folder)["gaussians.safetensors"] for folder in folders}) == len(folders)
@@ -397,7 +417,7 @@ def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world
     paper = run_preset("paper").fit
     virtual = replace(paper.virtual, perception="filters", start=0.0, probability=0.5)
     config = replace(settings("mudg_s", iterations=12), loss=paper.loss, virtual=virtual)
-    fit.run(config, world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"])
+    Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "fit", settings=config).run()
     assert seen[True] == {"virtual_perceptual", "virtual_depth", "virtual_semantics"}
     assert {"color", "lidar", "sky"} <= seen[False] and "semantics" not in seen[False]
 

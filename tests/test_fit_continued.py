@@ -24,6 +24,7 @@ from mudg.models.scene.appearance import Appearance
 from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import continued
+from mudg.steps.fit import Fit
 
 SIZE = (60, 40)
 FRAMES = 6
@@ -51,13 +52,13 @@ def world(tmp_path_factory) -> dict[str, Path]:
     with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
         for view in path.views:
             writer.add(truth(view.resized(30, 20)))
-    fit.run(settings("street_gaussians", iterations=80), root / "scene", root / "fuse", root / "plain")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "plain", settings=settings("street_gaussians", iterations=80)).run()
     return {name: root / name for name in ("scene", "fuse", "virtual", "plain")}
 
 
 def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **changes) -> Path:
-    named = {"observations": world["virtual"], "start": world["plain"], **changes}
-    return fit.run(config or settings(), world["scene"], world["fuse"], out, **named)
+    named = {"observations": (world["virtual"],), "start_from": world["plain"], **changes}
+    return Fit(**{"scene": world["scene"], "fused": world["fuse"], "out": out, "settings": config or settings(), **named}).run()
 
 
 def psnr_beside(folder: Path) -> float:
@@ -121,11 +122,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(world, tmp_path, monkeypatch)
 def test_another_start_is_another_fit(world, tmp_path):
     go_on(world, tmp_path / "fit", settings(iterations=2))
     with pytest.raises(UsageError, match="another configuration"):
-        go_on(world, tmp_path / "fit", settings(iterations=2), start=None)
+        go_on(world, tmp_path / "fit", settings(iterations=2), start_from=None)
 
 
 def test_a_fit_without_virtual_views_goes_on_too(world, tmp_path):
-    made = go_on(world, tmp_path / "fit", settings("street_gaussians", iterations=4), observations=None)
+    made = go_on(world, tmp_path / "fit", settings("street_gaussians", iterations=4), observations=())
     assert fit.load_model(made).facts["method"] == "street_gaussians"
 
 
@@ -148,8 +149,8 @@ def test_classes_that_only_virtual_views_show_are_added(world):
 
 def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
     changes = {"appearance__cameras": True, "appearance__exposure": "camera"}
-    arguments = (world["scene"], world["fuse"])
-    plain = fit.run(settings("street_gaussians", iterations=12, **changes), *arguments, tmp_path / "plain")
+    settled = settings("street_gaussians", iterations=12, **changes)
+    plain = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "plain", settings=settled).run()
     learnt = store.read_tensors(plain / "appearance.safetensors")
     start = continued.StartFit(plain, "")
     names = store.read_json(plain / "appearance.json")["names"]
@@ -160,7 +161,7 @@ def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
     assert torch.equal(kept.tables["virtual"]["affine"], torch.zeros(1, 3, 4))
     other = continued.continued_appearance(start, Appearance({"cameras": ("front/999999",)}))
     assert other.tables["cameras"]["shift"].abs().max() == 0
-    go_on(world, tmp_path / "more", settings(iterations=2, **changes), start=plain)
+    go_on(world, tmp_path / "more", settings(iterations=2, **changes), start_from=plain)
 
 
 # ---- what is refused -------------------------------------------------------------------------------------------------
@@ -175,20 +176,20 @@ def test_another_scene_cloud_or_method_is_refused(world, tmp_path):
         go_on({**world, "fuse": tmp_path / "fuse"}, tmp_path / "b")
     guided = go_on(world, tmp_path / "guided", settings(iterations=1))
     with pytest.raises(InputError, match=r"on recorded views[\s\S]*street_gaussians[\s\S]*mudg_s"):
-        go_on(world, tmp_path / "c", start=guided)
+        go_on(world, tmp_path / "c", start_from=guided)
     assert not any((tmp_path / name).exists() for name in "abc")
 
 
 def test_what_is_no_finished_fit_is_refused(world, tmp_path):
     for folder in (world["fuse"], world["scene"], tmp_path / "nothing"):
         with pytest.raises(InputError, match=r"no finished fit to go on with[\s\S]*--start-from"):
-            go_on(world, tmp_path / "fit", start=folder)
+            go_on(world, tmp_path / "fit", start_from=folder)
     unfinished = tmp_path / "unfinished"
     shutil.copytree(world["plain"], unfinished)
     state = store.read_json(unfinished / "run.json")
     store.write_json(unfinished / "run.json", {**state, "state": "interrupted"})
     with pytest.raises(InputError, match="interrupted"):
-        go_on(world, tmp_path / "fit", start=unfinished)
+        go_on(world, tmp_path / "fit", start_from=unfinished)
     with pytest.raises(UsageError, match=r"spherical harmonics[\s\S]*--sh-degree 0"):
         go_on(world, tmp_path / "fit", settings(sh_degree=1))
     with pytest.raises(UsageError, match="the output is also an input"):

@@ -37,12 +37,15 @@ from mudg.models.scene.mcmc import McmcSettings, drift, order_of_place, relocate
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import StaticNode
 from mudg.models.scene.sky import SkyNode
-from mudg.stages import fit, render, score
+from mudg.stages import fit, score
 from mudg.stages.config import BenchConfig, FitConfig, RenderConfig, RunConfig, ScoreConfig, with_device
 from mudg.stages.config.fit import VirtualConfig
 from mudg.stages.fitting.finite import FiniteCheck
 from mudg.stages.fitting.perception import perception_of
 from mudg.stages.fitting.planes import render_planes
+from mudg.steps.fit import Fit
+from mudg.steps.render import RenderViews
+from mudg.steps.score import Score
 
 SIZE, FRAMES = (36, 24), 4
 PRETEND = torch.device("pretend", 0)
@@ -106,7 +109,7 @@ def assert_same_fit(mine: Path, theirs: Path) -> None:
 
 
 def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -> Path:
-    return fit.run(config, world["scene"], world["fuse"], out, observations=world["virtual"], **more)
+    return Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=out, settings=config, **more).run()
 
 
 CASES = {
@@ -155,9 +158,9 @@ def test_a_fit_goes_on_on_the_other_device(world, tmp_path, monkeypatch):
     with twins():
         parts = fitted(world, tmp_path / "parts", settings("street_gaussians", "cpu"))
         assert_same_fit(parts, whole)
-        here = fitted(world, tmp_path / "here", settings("mudg_s", "cpu", iterations=2), start=whole)
+        here = fitted(world, tmp_path / "here", settings("mudg_s", "cpu", iterations=2), start_from=whole)
     with pretend_device():
-        there = fitted(world, tmp_path / "there", settings("mudg_s", "pretend", iterations=2), start=whole)
+        there = fitted(world, tmp_path / "there", settings("mudg_s", "pretend", iterations=2), start_from=whole)
     assert_same_fit(there, here)
 
 
@@ -168,7 +171,7 @@ def test_a_fit_goes_on_on_the_other_device(world, tmp_path, monkeypatch):
 def plain_fit(world, tmp_path_factory) -> Path:
     """A short fit on the CPU, with the native library."""
     config = fit_config(method="street_gaussians", iterations=30, start__gaussians=120, device="cpu")
-    return fit.run(config, world["scene"], world["fuse"], tmp_path_factory.mktemp("fit") / "out")
+    return Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path_factory.mktemp("fit") / "out", settings=config).run()
 
 
 class Steps:
@@ -437,11 +440,13 @@ def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
 def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypatch):
     drawn = RenderConfig(cameras=("front",), shifts_m=(0.0,), video=False, raster="torch", device="cpu")
     with twins():
-        here = render.run(drawn, world["scene"], plain_fit, tmp_path / "here")
+        here = RenderViews(scene=world["scene"], model=plain_fit, out=tmp_path / "here", settings=drawn).run()
     with pretend_device():
-        there = render.run(replace(drawn, device="pretend"), world["scene"], plain_fit, tmp_path / "there")
+        there = RenderViews(
+            scene=world["scene"], model=plain_fit, out=tmp_path / "there", settings=replace(drawn, device="pretend")
+        ).run()
         assert (
-            render.run(replace(drawn, device="pretend"), world["scene"], plain_fit, here) == here
+            RenderViews(scene=world["scene"], model=plain_fit, out=here, settings=replace(drawn, device="pretend")).run() == here
         )  # a result is one on any device
     mine, theirs = (read_observations(folder / "front_recorded") for folder in (there, here))
     for index in range(len(mine)):
@@ -449,9 +454,9 @@ def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypa
     config = ScoreConfig(baseline=False, perceptual_views=2, error_pictures=False, device="cpu")
     monkeypatch.setattr(score, "computed_ahead", lambda compute, count, threads: map(compute, range(count)))
     with twins():
-        score.run(config, world["scene"], {"fit": here}, tmp_path / "score_here")
+        Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config).run()
     with pretend_device(), transfers() as seen:
-        score.run(replace(config, device="pretend"), world["scene"], {"fit": here}, tmp_path / "score_there")
+        Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_there", settings=replace(config, device="pretend")).run()
     assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"models/featnets.py"}
     found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
     values = [document["by_distance"][0]["values"] for document in found]

@@ -39,6 +39,7 @@ from mudg.data.importers.options import ImportOptions
 from mudg.data.scene import read_image, read_points
 from mudg.stages import fuse
 from mudg.stages.config import FuseConfig
+from mudg.steps.fuse import Fuse
 
 RULES = FusionRules(min_object_points=1)
 
@@ -421,7 +422,7 @@ def test_stage_writes_reuses_and_refuses(tmp_path: Path) -> None:
     street = ToyStreet(car_start=(12, 0.5), car_velocity=(6, 0))
     street.write(tmp_path / "scene")
     config = FuseConfig(min_object_points=10)
-    out = fuse.run(config, tmp_path / "scene", tmp_path / "fuse")
+    out = Fuse(scene=tmp_path / "scene", out=tmp_path / "fuse", settings=config).run()
     cloud = read_fused(out)
     direct, _ = fuse_sweeps(
         (s for i, s in enumerate(shots_of(street)) if i != 4), [street.track()], fuse.rules_of(config)
@@ -435,10 +436,10 @@ def test_stage_writes_reuses_and_refuses(tmp_path: Path) -> None:
     assert record["rules"]["min_object_points"] == 10
     assert (out / "top.png").stat().st_size > 1000
     before = (out / "static.safetensors").stat().st_mtime_ns
-    fuse.run(config, tmp_path / "scene", out)
+    Fuse(scene=tmp_path / "scene", out=out, settings=config).run()
     assert (out / "static.safetensors").stat().st_mtime_ns == before
     with pytest.raises(UsageError, match="another configuration"):
-        fuse.run(FuseConfig(voxel_m=0.2), tmp_path / "scene", out)
+        Fuse(scene=tmp_path / "scene", out=out, settings=FuseConfig(voxel_m=0.2)).run()
 
 
 def test_a_changed_cloud_is_noticed(tmp_path: Path) -> None:

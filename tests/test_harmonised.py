@@ -38,12 +38,16 @@ from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.models.published.model import PublishedMDM
-from mudg.stages import edit, fit, render, synthesize
+from mudg.stages import fit, synthesize
 from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
 from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
 from mudg.stages.editing.harmonised_weather import corrected
 from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.vacated import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
+from mudg.steps.edit import Edit
+from mudg.steps.fit import Fit
+from mudg.steps.render import RenderViews
+from mudg.steps.synthesize import Synthesize
 
 CAR = (0.6, 1.0, 1.0)
 
@@ -237,7 +241,7 @@ def run(tmp_path_factory) -> Path:
     write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
     write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
     config = fit_config(method="street_gaussians", iterations=40, start__gaussians=900, densify__max_gaussians=1500)
-    fit.run(config, root / "scene", root / "fuse", root / "fit" / "street_gaussians")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
     torch.manual_seed(0)
     files.save(MDM(SMALL), root / "model", "", {})
     return root
@@ -275,14 +279,18 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
     config = SynthesizeConfig(shifts_m=(0.0,), model=str(run / "model"), steps=1, full_size=False, processes=1, precision="float32")
     edits, parts = script(tmp_path, "- remove: {ids: [car]}"), (run / "scene", run / "fuse")
-    plain = synthesize.run(config, *parts, tmp_path / "plain")
-    made = synthesize.run(config, *parts, tmp_path / "made", edits=edits)
-    fitted = synthesize.run(config, *parts, tmp_path / "fitted", edits=edits, fitted=run / "fit" / "street_gaussians")
+    plain = Synthesize(scene=parts[0], fused=parts[1], out=tmp_path / "plain", settings=config).run()
+    made = Synthesize(scene=parts[0], fused=parts[1], edits=edits, out=tmp_path / "made", settings=config).run()
+    fitted = Synthesize(
+        scene=parts[0], fused=parts[1], edits=edits, fitted=run / "fit" / "street_gaussians", out=tmp_path / "fitted", settings=config
+    ).run()
     pictures = [[v.rgb for v in views_of(folder)] for folder in (plain, made, fitted)]
     assert not any(torch.equal(a, b) for a, b in zip(pictures[0], pictures[1], strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(pictures[1], pictures[2], strict=True))
     with pytest.raises(InputError, match="no object of this id"):
-        synthesize.run(config, *parts, tmp_path / "bad", edits=script(tmp_path, "- remove: {ids: [cat]}"))
+        Synthesize(
+            scene=parts[0], fused=parts[1], edits=script(tmp_path, "- remove: {ids: [cat]}"), out=tmp_path / "bad", settings=config
+        ).run()
     assert not (tmp_path / "bad").exists()
 
 
@@ -291,9 +299,11 @@ def test_renders_are_repaired_where_the_edit_touches_them(run: Path, tmp_path: P
     config = RenderConfig(shifts_m=(0.0,), video=False)
     repaired = replace(config, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, keep_classes=False, feather_px=0))
     with pytest.raises(UsageError, match="--fused"):
-        render.run(repaired, run / "scene", fitted, tmp_path / "none", edits=edits)
+        RenderViews(scene=run / "scene", model=fitted, edits=edits, out=tmp_path / "none", settings=repaired).run()
     before, physical, made = (
-        views_of(render.run(settings, run / "scene", fitted, tmp_path / name, edits=file, fused=run / "fuse"))
+        views_of(RenderViews(
+            scene=run / "scene", fused=run / "fuse", model=fitted, edits=file, out=tmp_path / name, settings=settings
+        ).run())
         for name, settings, file in (("before", config, None), ("physical", config, edits), ("made", repaired, edits))
     )
     assert len(made) == FRAMES
@@ -314,7 +324,9 @@ def test_weather_is_that_of_the_formulas_with_another_model(run: Path, tmp_path:
     plain = RenderConfig(shifts_m=(0.0,), video=False)
     asked = replace(plain, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, weather=1.0))
     physical, kept = (
-        views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse"))
+        views_of(RenderViews(
+            scene=run / "scene", fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / name, settings=config
+        ).run())
         for name, config in (("physical", plain), ("asked", asked))
     )
     assert "no published-type model" in capsys.readouterr().err
@@ -335,8 +347,8 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
     """Its images say which pixels were not recorded; warps leave these out; a fit goes on with the run's own fit."""
     harmonize = HarmonizeConfig(on=True, model=str(run / "model"), steps=1, keep_classes=False)
     edits = script(tmp_path, "- remove: {ids: [car]}")
-    out = edit.run(EditConfig(harmonize=harmonize), run, edits, tmp_path / "edited")
-    plain = edit.run(EditConfig(), run, edits, tmp_path / "plain")
+    out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=EditConfig(harmonize=harmonize)).run()
+    plain = Edit(source=run, script=edits, out=tmp_path / "plain", settings=EditConfig()).run()
     scene, other, old = read_scene(out / "scene"), read_scene(plain / "scene"), read_scene(run / "scene")
     differ = 0
     for frame, rendered, recorded in zip(scene.frames, other.frames, old.frames, strict=True):
@@ -348,12 +360,19 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
     photos = synthesize.recorded_images(scene, SynthesizeConfig())
     assert all(np.array_equal(~p.usable, read_label(scene, f, "rendered")) for p, f in zip(photos, scene.frames_in("train"), strict=True))
     config = fit_config(method="street_gaussians", iterations=4, start__gaussians=900, densify__max_gaussians=1500)
-    again = fit.run(config, out / "scene", out / "fuse", tmp_path / "again", start=out / "fit" / "street_gaussians")
+    again = Fit(
+        scene=out / "scene", fused=out / "fuse", start_from=out / "fit" / "street_gaussians", out=tmp_path / "again", settings=config
+    ).run()
     assert "car" not in fit.load_model(again).node_names()
     with pytest.raises(InputError, match="another scene"):
-        fit.run(config, run / "scene", run / "fuse", tmp_path / "wrong", start=out / "fit" / "street_gaussians")
+        Fit(
+            scene=run / "scene", fused=run / "fuse", start_from=out / "fit" / "street_gaussians", out=tmp_path / "wrong", settings=config
+        ).run()
     with pytest.raises(UsageError, match="no images"):
-        edit.run(EditConfig(harmonize=harmonize), run / "fit" / "street_gaussians", edits, tmp_path / "alone", scene=run / "scene")
+        Edit(
+            source=run / "fit" / "street_gaussians", script=edits, scene=run / "scene", out=tmp_path / "alone",
+            settings=EditConfig(harmonize=harmonize),
+        ).run()  # fmt: skip
 
 
 @pytest.mark.slow
@@ -435,7 +454,9 @@ def test_weather_is_generated_by_a_published_type_model(run: Path, published: st
     def rendered(name: str, **settings: Any) -> dict[str, list[Observation]]:
         harmonize = HarmonizeConfig(on=bool(settings), model=published, steps=1, weather=1.0) if settings else HarmonizeConfig()
         config = replace(RenderConfig(shifts_m=(0.0, 1.0), video=False), harmonize=harmonize)
-        out = render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=run / "fuse" if settings else None)
+        out = RenderViews(
+            scene=run / "scene", fused=run / "fuse" if settings else None, model=fitted, edits=edits, out=tmp_path / name, settings=config
+        ).run()
         return {path: views_of(out, path) for path in ("front_recorded", "front_shift+1.0")}
 
     before, given = rendered("physical"), watched(monkeypatch)
@@ -459,14 +480,14 @@ def test_views_are_generated_in_weather_by_a_published_type_model(run: Path, pub
     edits, folders, fitted = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse"), run / "fit" / "street_gaussians"
     config = SynthesizeConfig(shifts_m=(1.0,), model=published, steps=1, precision="float32")
     given = watched(monkeypatch)
-    synthesize.run(config, *folders, tmp_path / "day")
-    synthesize.run(config, *folders, tmp_path / "night", fitted=fitted, edits=edits)
+    Synthesize(scene=folders[0], fused=folders[1], out=tmp_path / "day", settings=config).run()
+    Synthesize(scene=folders[0], fused=folders[1], fitted=fitted, edits=edits, out=tmp_path / "night", settings=config).run()
     day, night = given
     assert float(night.reference.mean()) < 0.6 * float(day.reference.mean())
     assert float(night.color.mean()) < 0.6 * float(day.color.mean())
     assert torch.equal(day.depth, night.depth)
     with pytest.raises(UsageError, match="for weather and light of --edits only"):
-        synthesize.run(config, *folders, tmp_path / "other", fitted=fitted)
+        Synthesize(scene=folders[0], fused=folders[1], fitted=fitted, out=tmp_path / "other", settings=config).run()
 
 
 def test_a_removed_car_is_repaired_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch) -> None:
@@ -477,7 +498,9 @@ def test_a_removed_car_is_repaired_by_a_published_type_model(run: Path, publishe
     def rendered(name: str, harmonize: HarmonizeConfig) -> list[Observation]:
         config = replace(RenderConfig(shifts_m=(0.0,), video=False), harmonize=harmonize)
         fused = run / "fuse" if harmonize.on else None
-        return views_of(render.run(config, run / "scene", fitted, tmp_path / name, edits=edits, fused=fused))
+        return views_of(RenderViews(
+            scene=run / "scene", fused=fused, model=fitted, edits=edits, out=tmp_path / name, settings=config
+        ).run())
 
     before = rendered("plain", HarmonizeConfig())
     made = rendered("made", HarmonizeConfig(on=True, model=published, steps=1, keep_classes=False))
@@ -497,5 +520,5 @@ def test_what_published_type_models_cannot_harmonise_is_refused_first(run: Path,
         write_scene(scene, frames=3, cameras=("front",), width=60, height=40)
     config = RenderConfig(shifts_m=(0.0,), video=False, harmonize=HarmonizeConfig(on=True, model=published, steps=1, **settings))
     with pytest.raises(UsageError, match=message):
-        render.run(config, scene, fitted, tmp_path / "out", edits=edits, fused=run / "fuse")
+        RenderViews(scene=scene, fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / "out", settings=config).run()
     assert not (tmp_path / "out").exists()

@@ -24,9 +24,9 @@ from mudg.base import store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.plain_yaml import DEEPEST, LARGEST_BYTES, parse_yaml
 from mudg.data.edits.script import parse_edits
-from mudg.stages import ingest
 from mudg.stages.config import IngestConfig
 from mudg.stages.learning.scene_list import read_list
+from mudg.steps.ingest import Ingest
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 
@@ -116,7 +116,9 @@ def test_no_import_waits_for_a_pipe(kind: str, tmp_path: Path) -> None:
     for name in replaced_one_by_one(tmp_path / "in"):
         with ends_within(20):
             try:
-                ingest.run(IngestConfig(format=kind, workers=1, contact_sheet=False), log, tmp_path / "out", overwrite=True)
+                Ingest(
+                    log=log, out=tmp_path / "out", overwrite=True, settings=IngestConfig(format=kind, workers=1, contact_sheet=False)
+                ).run()
             except MudgError:
                 refused.append(name)
         shutil.rmtree(tmp_path / "out", ignore_errors=True)

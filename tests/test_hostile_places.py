@@ -14,9 +14,9 @@ from mudg import app
 from mudg.base.errors import InputError
 from mudg.data.city.config import CityConfig
 from mudg.data.scene import read_scene
-from mudg.stages import ingest
 from mudg.stages.config import IngestConfig
 from mudg.stages.score_truth import truth_of
+from mudg.steps.ingest import Ingest
 
 GONE = ["doctor", "fuse scene --out out", "view run", "convert a --to b", "run city --out out", "batch status out"]
 
@@ -66,7 +66,9 @@ def test_a_limit_of_the_shell_below_our_own_is_kept(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def city(tmp_path_factory: pytest.TempPathFactory) -> Any:
     tiny = CityConfig(n_frames=2, width=32, height=24, cameras=("front",), lidar_beams=4)
-    scene = read_scene(ingest.run(IngestConfig(city=tiny, contact_sheet=False), "city", tmp_path_factory.mktemp("city") / "scene"))
+    scene = read_scene(Ingest(
+        log="city", out=tmp_path_factory.mktemp("city") / "scene", settings=IngestConfig(city=tiny, contact_sheet=False)
+    ).run())
     assert truth_of(scene).exact
     return scene
 

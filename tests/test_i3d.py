@@ -15,9 +15,9 @@ from mudg.base.errors import InputError
 from mudg.data.scene import read_scene
 from mudg.models import i3d
 from mudg.pages import page, score_tables
-from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring import distributions, videos
+from mudg.steps.score import Score
 
 
 def made_up() -> dict[str, torch.Tensor]:
@@ -158,7 +158,7 @@ def test_the_scorer_writes_fvd_with_its_sizes_and_floor(tmp_path: Path, monkeypa
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
     config = ScoreConfig(fvd_weights=str(weights), perceptual_views=0, error_pictures=False)
-    out = score.run(config, scene, {"a": views}, tmp_path / "score")
+    out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()
     document = store.read_json(out / "metrics.json")
     for row in document["results"]:  # all views count, on the recorded path as well
         assert row["values"]["fvd"] == pytest.approx(0.0, abs=1e-5)

@@ -33,7 +33,7 @@ TINY_CITY = CityConfig(
 
 def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(ingest.run(IngestConfig(), str(drive), tmp_path / "out"))
+    scene = read_scene(Ingest(log=str(drive), out=tmp_path / "out", settings=IngestConfig()).run())
     direct = IMPORTERS["kitti"](drive, tmp_path / "direct", ImportOptions())
     assert scene_to_json_text(scene) == scene_to_json_text(direct)
     summary = store.read_json(tmp_path / "out" / "run.json")["summary"]
@@ -44,7 +44,7 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
 
 def test_flags_reach_the_importer(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(ingest.run(IngestConfig(frames="1:6", test_every=2, untwist="no"), drive, tmp_path / "out"))
+    scene = read_scene(Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig(frames="1:6", test_every=2, untwist="no")).run())
     assert len(scene.frames) == 5
     assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
     assert not read_points(scene, scene.sweeps[0]).dt_s.any()
@@ -53,7 +53,7 @@ def test_flags_reach_the_importer(tmp_path: Path) -> None:
 def test_images_are_resized_with_their_camera_and_points_stay_on_them(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     full = IMPORTERS["kitti"](drive, tmp_path / "full", ImportOptions())
-    small = read_scene(ingest.run(IngestConfig(resolution="31"), drive, tmp_path / "small"))
+    small = read_scene(Ingest(log=drive, out=tmp_path / "small", settings=IngestConfig(resolution="31")).run())
     a, b = full.cameras["front"], small.cameras["front"]
     assert max(b.width, b.height) == 31
     assert b == a.resized(b.width, b.height)
@@ -64,14 +64,14 @@ def test_images_are_resized_with_their_camera_and_points_stay_on_them(tmp_path: 
 
 def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    out = ingest.run(IngestConfig(workers=1), drive, tmp_path / "one")
+    out = Ingest(log=drive, out=tmp_path / "one", settings=IngestConfig(workers=1)).run()
     listed = store.read_json(out / "manifest.json")["files"]
-    again = store.read_json(ingest.run(IngestConfig(workers=3), drive, tmp_path / "three") / "manifest.json")["files"]
+    again = store.read_json(Ingest(log=drive, out=tmp_path / "three", settings=IngestConfig(workers=3)).run() / "manifest.json")["files"]
     assert {n: f for n, f in listed.items() if not n.startswith("run.")} == {
         n: f for n, f in again.items() if not n.startswith("run.")
     }
     made_ns = (out / "scene.json").stat().st_mtime_ns
-    ingest.run(IngestConfig(workers=2), drive, out)
+    Ingest(log=drive, out=out, settings=IngestConfig(workers=2)).run()
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
 
 
@@ -107,7 +107,7 @@ def test_words_that_make_no_sense(words: list[str], out: str | None, expected: s
     with pytest.raises(UsageError, match="--format was given twice"):
         app.parse(["ingest", "custom", "log", "o", "--format", "kitti"])
     with pytest.raises(UsageError, match="no such format") as caught:
-        ingest.run(IngestConfig(format="rosbag"), "log", Path("o"))
+        Ingest(log="log", out=Path("o"), settings=IngestConfig(format="rosbag")).run()
     assert "kitti" in caught.value.expected
 
 
@@ -115,30 +115,30 @@ def test_unknown_folders_and_missing_ones_are_named(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"x")
     with pytest.raises(InputError, match="not recognised") as caught:
-        ingest.run(IngestConfig(), str(tmp_path / "photos"), tmp_path / "out")
+        Ingest(log=str(tmp_path / "photos"), out=tmp_path / "out", settings=IngestConfig()).run()
     assert "a.jpg" in caught.value.got
     with pytest.raises(InputError, match="does not exist"):
-        ingest.run(IngestConfig(), str(tmp_path / "nowhere"), tmp_path / "out")
+        Ingest(log=str(tmp_path / "nowhere"), out=tmp_path / "out", settings=IngestConfig()).run()
     assert not (tmp_path / "out").exists()
     (tmp_path / "photos" / "image_02").mkdir()
     with pytest.raises(InputError, match="no KITTI images"):
-        ingest.run(IngestConfig(format="kitti"), str(tmp_path / "photos"), tmp_path / "out")
+        Ingest(log=str(tmp_path / "photos"), out=tmp_path / "out", settings=IngestConfig(format="kitti")).run()
 
 
 def test_finished_work_is_reused_and_other_settings_are_refused(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    out = ingest.run(IngestConfig(), drive, tmp_path / "out")
+    out = Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()
     made_ns = (out / "scene.json").stat().st_mtime_ns
     assert (
-        ingest.run(IngestConfig(city=CityConfig(seed=5)), drive, out) == out
+        Ingest(log=drive, out=out, settings=IngestConfig(city=CityConfig(seed=5))).run() == out
     )  # the city's settings do not matter here
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
     with pytest.raises(UsageError, match="another configuration"):
-        ingest.run(IngestConfig(test_every=3), drive, out)
+        Ingest(log=drive, out=out, settings=IngestConfig(test_every=3)).run()
     (drive / "tracklet_labels.xml").unlink()  # the log changed
     with pytest.raises(UsageError, match="another configuration"):
-        ingest.run(IngestConfig(), drive, out)
-    assert len(read_scene(ingest.run(IngestConfig(), drive, out, overwrite=True)).tracks) == 0
+        Ingest(log=drive, out=out, settings=IngestConfig()).run()
+    assert len(read_scene(Ingest(log=drive, out=out, overwrite=True, settings=IngestConfig()).run()).tracks) == 0
 
 
 def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -> None:
@@ -146,13 +146,13 @@ def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -
     for part in ("image_02", "velodyne"):
         shutil.copytree(root / part / "0003", root / part / "0004")
     config = IngestConfig(sequence="0003", contact_sheet=False)
-    out = ingest.run(config, root, tmp_path / "out")
+    out = Ingest(log=root, out=tmp_path / "out", settings=config).run()
     (root / "image_02" / "0004" / "000001.png").write_bytes(b"another log")
-    assert ingest.run(config, root, out) == out
+    assert Ingest(log=root, out=out, settings=config).run() == out
     labels = root / "label_02" / "0003.txt"
     labels.write_text(labels.read_text() + "\n")
     with pytest.raises(UsageError, match="another configuration") as caught:
-        ingest.run(config, root, out)
+        Ingest(log=root, out=out, settings=config).run()
     assert "input 'source' changed" in caught.value.got
     listed = files_of("kitti", root, ImportOptions(sequence="0003")).files
     assert {path.relative_to(root).as_posix() for path in listed} == {
@@ -186,7 +186,7 @@ def test_what_is_odd_about_a_scene_is_said_when_it_is_made(tmp_path: Path, capsy
     for row in rows:
         row[-1] = str(float(row[-1]) + np.pi / 2)
     labels.write_text("\n".join(" ".join(row) for row in rows) + "\n")
-    ingest.run(IngestConfig(contact_sheet=False), drive, tmp_path / "out")
+    Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig(contact_sheet=False)).run()
     assert "track 7 (car): it moves sideways" in capsys.readouterr().err
 
 
@@ -197,38 +197,38 @@ def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) ->
     scan.write_bytes(content[:-5])
     for config, words in ((IngestConfig(), "cut off"), (IngestConfig(cameras=("frnt",)), "no such camera")):
         with pytest.raises(MudgError, match=words):
-            ingest.run(config, drive, tmp_path / "out")
+            Ingest(log=drive, out=tmp_path / "out", settings=config).run()
         assert [path.name for path in tmp_path.iterdir()] == ["day"]
     (tmp_path / "out").mkdir()
     with pytest.raises(InputError, match="cut off"):
-        ingest.run(IngestConfig(), drive, tmp_path / "out")
+        Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()
     assert list((tmp_path / "out").iterdir()) == []
     scan.write_bytes(content)
-    assert len(read_scene(ingest.run(IngestConfig(), drive, tmp_path / "out")).frames) == 6
+    assert len(read_scene(Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()).frames) == 6
 
 
 def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     config, out = IngestConfig(contact_sheet=False), tmp_path / "out"
-    RunDir.open(out, ingest._OUTPUT, {"frames": "0:2"}, {"source": "another"})
+    RunDir.open(out, Ingest(log="city", out=out, settings=config).output(), {"frames": "0:2"}, {"source": "another"})
     partial = out / ".scene.999999999-1.part"
     partial.mkdir()
     store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
     with pytest.raises(ResourceError, match="another process"):
-        ingest.run(config, drive, out)
+        Ingest(log=drive, out=out, settings=config).run()
     assert partial.is_dir()
     store.write_json(out / "lock", {"pid": 999_999_999, "host": socket.gethostname()})
-    assert len(read_scene(ingest.run(config, drive, out)).frames) == 6
+    assert len(read_scene(Ingest(log=drive, out=out, settings=config).run()).frames) == 6
     assert not partial.exists()
 
 
 def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_again(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    out = ingest.run(IngestConfig(), drive, tmp_path / "out")
+    out = Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()
     state = store.read_json(out / "run.json")
     store.write_json(out / "run.json", {**state, "state": "running"})
     made_ns = (out / "scene.json").stat().st_mtime_ns
-    ingest.run(IngestConfig(), drive, out)
+    Ingest(log=drive, out=out, settings=IngestConfig()).run()
     assert store.read_json(out / "run.json")["state"] == "complete"
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
 
@@ -237,7 +237,7 @@ def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_ag
 def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) -> None:
     scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene")
     source = write_zip(tmp_path / "scene", tmp_path / "scene.zip") if packed else tmp_path / "scene"
-    copy = read_scene(ingest.run(IngestConfig(), source, tmp_path / "out"))
+    copy = read_scene(Ingest(log=source, out=tmp_path / "out", settings=IngestConfig()).run())
     assert scene_to_json_text(copy) == scene_to_json_text(scene)
     assert (copy.tracks[0].world_from_object == scene.tracks[0].world_from_object).all()
     for frame in scene.frames:
@@ -250,16 +250,16 @@ def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) 
         (IngestConfig(frames="0:2"), IngestConfig(cameras=("front",)), IngestConfig(resolution="60"))
     ):
         with pytest.raises(UsageError, match="does not apply to a scene"):
-            ingest.run(config, source, tmp_path / f"refused{index}")
+            Ingest(log=source, out=tmp_path / f"refused{index}", settings=config).run()
         with pytest.raises(UsageError, match="settings of its own"):
-            ingest.run(config, "city", tmp_path / f"city{index}")
+            Ingest(log="city", out=tmp_path / f"city{index}", settings=config).run()
 
 
 @needs_native
 def test_the_city_is_made_with_the_split_asked_for_and_always_the_same(tmp_path: Path) -> None:
     config = IngestConfig(city=TINY_CITY, test_every=2)
-    one = read_scene(ingest.run(config, "city", tmp_path / "one"))
-    two = read_scene(ingest.run(config, "city", tmp_path / "two"))
+    one = read_scene(Ingest(log="city", out=tmp_path / "one", settings=config).run())
+    two = read_scene(Ingest(log="city", out=tmp_path / "two", settings=config).run())
     assert one.source.recipe is not None
     assert len(one.frames) == 6
     assert [i for i, s in one.split.items() if s == "test"] == ["front/000002", "front/000004"]

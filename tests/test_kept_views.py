@@ -32,6 +32,7 @@ from mudg.stages.fitting import kept, trust
 from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.start import StartPoints
 from mudg.stages.fitting.views import LidarPixels, StoredView, TrainView, ViewSet
+from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6
 ODD = (7, 5)
@@ -298,8 +299,8 @@ def result_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_fit_from_a_file_of_views_is_the_same_fit_also_when_resumed(world, tmp_path, monkeypatch):
-    arguments = (settings(), world["scene"], world["fuse"])
-    usual = fit.run(*arguments, tmp_path / "usual", observations=world["virtual"])
+    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole", settings=settings())
+    usual = replace(step, out=tmp_path / "usual").run()
     monkeypatch.setattr(kept, "IN_MEMORY_BYTES", 0)
     before, adam_step, folder, asked = threads_at_work(), fit.adam_step, tmp_path / "filed", []
 
@@ -311,11 +312,11 @@ def test_a_fit_from_a_file_of_views_is_the_same_fit_also_when_resumed(world, tmp
 
     monkeypatch.setattr(fit, "adam_step", ctrl_c)
     with pytest.raises(KeyboardInterrupt):
-        fit.run(*arguments, folder, observations=world["virtual"])
+        replace(step, out=folder).run()
     assert asked == [2]  # recorded and virtual views
     assert threads_at_work() == before and open_in(folder) == []
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    fit.run(*arguments, folder, observations=world["virtual"])
+    replace(step, out=folder).run()
     assert result_of(folder) == result_of(usual)
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     assert names == {path.relative_to(tmp_path / "usual").as_posix() for path in (tmp_path / "usual").rglob("*")}
@@ -331,7 +332,7 @@ def test_a_wrong_frame_is_named_by_the_thread_that_reads_it(world, tmp_path):
     image.write_bytes(image.read_bytes()[:200])
     before = threads_at_work()
     with pytest.raises(fit_views.InputError, match=image.name):
-        fit.run(replace(settings(), method="street_gaussians"), scene, world["fuse"], tmp_path / "fit")
+        Fit(scene=scene, fused=world["fuse"], out=tmp_path / "fit", settings=replace(settings(), method="street_gaussians")).run()
     assert threads_at_work() == before
 
 

@@ -16,6 +16,7 @@ from mudg.models.mdm import files
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import score as learn_score
+from mudg.steps.learn import Learn
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def clips(tmp_path_factory):
 @pytest.fixture(scope="module")
 def whole(clips, tmp_path_factory):
     """The model of an undisturbed run."""
-    return learn.run(tiny(clips, checkpoint_every=100), tmp_path_factory.mktemp("whole") / "run")
+    return Learn(out=tmp_path_factory.mktemp("whole") / "run", settings=tiny(clips, checkpoint_every=100)).run()
 
 
 def weights(folder):
@@ -44,13 +45,13 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whol
 
     monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
     with pytest.raises(KeyboardInterrupt):
-        learn.run(config, tmp_path / "parts")
+        Learn(out=tmp_path / "parts", settings=config).run()
     monkeypatch.setattr(learn, "draw_clips", draw)
     saved = checkpoint.latest(tmp_path / "parts" / "steps")
     assert saved is not None and saved.step == 2  # the step that was under way was finished
     assert json.loads((tmp_path / "parts" / "run.json").read_text())["state"] == "interrupted"
     assert not (tmp_path / "parts" / "model").exists()
-    parts = learn.run(with_settings(config, log_every=1), tmp_path / "parts")  # how often is written down may change
+    parts = Learn(out=tmp_path / "parts", settings=with_settings(config, log_every=1)).run()  # how often is written down may change
     first, second = weights(whole), weights(parts)
     assert all(torch.equal(first[name], second[name]) for name in first)
     scores = [json.loads((p.parent / "metrics.json").read_text()) for p in (whole, parts)]
@@ -59,7 +60,7 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whol
 
 def test_outputs_and_reuse(clips, tmp_path):
     out = tmp_path / "run"
-    model_folder = learn.run(tiny(clips, score_every=4), out)
+    model_folder = Learn(out=out, settings=tiny(clips, score_every=4)).run()
     assert (out / "samples" / "0000004.png").stat().st_size > 1000
     assert (out / "loss.png").is_file()
     content = json.loads((model_folder / "model.json").read_text())
@@ -67,23 +68,23 @@ def test_outputs_and_reuse(clips, tmp_path):
     assert content["facts"]["held_out"]["clips"] == 2
     assert "held-out" in (model_folder / "MODEL_CARD.md").read_text().lower()
     before = (model_folder / "model.json").stat().st_mtime_ns
-    assert learn.run(tiny(clips, score_every=4), out) == model_folder
+    assert Learn(out=out, settings=tiny(clips, score_every=4)).run() == model_folder
     assert (model_folder / "model.json").stat().st_mtime_ns == before
     with pytest.raises(UsageError):
-        learn.run(tiny(clips, steps=5), out)
+        Learn(out=out, settings=tiny(clips, steps=5)).run()
 
 
 def test_training_continues_from_a_model(clips, whole, tmp_path):
     first = whole
-    second = learn.run(tiny(clips, start=str(first), seed=1), tmp_path / "second")
+    second = Learn(out=tmp_path / "second", settings=tiny(clips, start=str(first), seed=1)).run()
     before, after = weights(first), weights(second)
     assert all(torch.equal(before[n], after[n]) for n in before if n.startswith("codec."))
     assert any(not torch.equal(before[n], after[n]) for n in before if n.startswith("net."))
     assert json.loads((second / "model.json").read_text())["facts"]["continued_from"]["recipe"]["steps"] == 4
     with pytest.raises(UsageError, match="another kind"):
-        learn.run(tiny(clips, start=str(first), widths=(32, 32)), tmp_path / "third")
+        Learn(out=tmp_path / "third", settings=tiny(clips, start=str(first), widths=(32, 32))).run()
     with pytest.raises(UsageError, match="another configuration"):  # an unfinished run, too, is of its settings
-        learn.run(tiny(clips, start=str(first), seed=2), tmp_path / "second")
+        Learn(out=tmp_path / "second", settings=tiny(clips, start=str(first), seed=2)).run()
 
 
 def test_class_weights_lift_rare_classes(clips):
@@ -101,7 +102,7 @@ def test_fewer_cities_than_training_begins_with_are_not_waited_for(clips, monkey
 
 def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
     with pytest.raises(NumericsError, match=r"network(.|\n)*step \d"):
-        learn.run(tiny(clips, lr=1e30, steps=20, checkpoint_every=1), tmp_path / "run")
+        Learn(out=tmp_path / "run", settings=tiny(clips, lr=1e30, steps=20, checkpoint_every=1)).run()
     saved = checkpoint.latest(tmp_path / "run" / "steps")
     if saved is not None:
         assert saved.step < 20
@@ -110,7 +111,7 @@ def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
 @pytest.mark.slow
 def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
     out = tmp_path / "run"
-    learn.run(tiny(clips, steps=30, lr=3e-3, checkpoint_every=100, batch_frames=8, log_every=10), out)
+    Learn(out=out, settings=tiny(clips, steps=30, lr=3e-3, checkpoint_every=100, batch_frames=8, log_every=10)).run()
     totals = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     totals = [entry["total"] for entry in totals if "total" in entry]
     assert totals[-1] < 0.95 * totals[0]  # measured: 0.90

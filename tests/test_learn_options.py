@@ -19,6 +19,7 @@ from mudg.stages.config import LearnConfig
 from mudg.stages.config.learn import LearnData, LearnNetwork
 from mudg.stages.learning import models as learn_models
 from mudg.stages.learning.state import TrainingState
+from mudg.steps.learn import Learn
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def large_clips(tmp_path_factory):
 @pytest.fixture(scope="module")
 def stage_one(clips, tmp_path_factory):
     """A model of a few steps at the small size."""
-    return learn.run(tiny(clips, steps=2), tmp_path_factory.mktemp("stage one") / "run")
+    return Learn(out=tmp_path_factory.mktemp("stage one") / "run", settings=tiny(clips, steps=2)).run()
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, sta
     before, start = files.load(stage_one).state_dict(), begun.state_dict()
     assert not fresh
     assert all(torch.equal(before[name], start[name]) for name in before)
-    after = files.load(learn.run(config, tmp_path / "two")).state_dict()
+    after = files.load(Learn(out=tmp_path / "two", settings=config).run()).state_dict()
     kept = {name for name in before if name.startswith("codec.") or ".temporal." in name}
     assert kept > {n for n in before if n.startswith("codec.")}
     assert all(torch.equal(before[name], after[name]) for name in kept)
@@ -96,7 +97,7 @@ def test_frozen_layers_need_some_to_freeze(clips):
 
 def test_an_embedded_kind_of_network_need_not_be_described_again(unrefined, clips, tmp_path):
     config = replace(tiny(clips, start=str(unrefined), steps=2, log_every=1, augment=False), network=LearnNetwork())
-    model = files.load(learn.run(config, tmp_path / "run"))
+    model = files.load(Learn(out=tmp_path / "run", settings=config).run())
     assert model.config == replace(files.load(unrefined).config, area_px=48 * 32)
 
 
@@ -107,7 +108,7 @@ def test_constant_rate_and_averages(clips):
 
 def test_clips_of_another_size_are_refused(clips, stage_one, tmp_path):
     with pytest.raises(InputError, match="another size"):
-        learn.run(tiny(clips, start=str(stage_one), width=96, height=64), tmp_path / "run")
+        Learn(out=tmp_path / "run", settings=tiny(clips, start=str(stage_one), width=96, height=64)).run()
 
 
 def test_tensorboard_is_asked_for_in_words(clips, tmp_path, monkeypatch):
@@ -116,7 +117,7 @@ def test_tensorboard_is_asked_for_in_words(clips, tmp_path, monkeypatch):
         importlib.util, "find_spec", lambda name, *rest: None if name == "tensorboard" else find(name, *rest)
     )
     with pytest.raises(ResourceError, match=r"pip install 'mudg\[track\]'"):
-        learn.run(tiny(clips, tensorboard=True), tmp_path / "run")
+        Learn(out=tmp_path / "run", settings=tiny(clips, tensorboard=True)).run()
 
 
 def test_moments_of_another_model_are_refused(clips, stage_one, tmp_path):

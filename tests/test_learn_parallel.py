@@ -17,12 +17,12 @@ from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
 from mudg.models.mdm import files
 from mudg.models.mdm.model import MDM, BatchPart, LossSettings
-from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
 from mudg.stages.learning import parallel as learn_parallel
 from mudg.stages.learning.parallel import Ranks
 from mudg.stages.learning.state import TrainingState, read_rows
+from mudg.steps.learn import Learn
 
 SAME = 2e-6
 """Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""
@@ -47,7 +47,7 @@ def environment():
 @pytest.mark.slow
 def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     common = {"batch_frames": 8, "log_every": 1, "checkpoint_every": 100, "steps": 6}
-    learn.run(tiny(clips, **common), tmp_path / "whole")
+    Learn(out=tmp_path / "whole", settings=tiny(clips, **common)).run()
 
     stop = TrainingState.blend
 
@@ -60,7 +60,7 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     TrainingState.blend = stop_after_two
     try:
         with pytest.raises(KeyboardInterrupt):
-            learn.run(tiny(clips, **common), tmp_path / "parts")
+            Learn(out=tmp_path / "parts", settings=tiny(clips, **common)).run()
     finally:
         TrainingState.blend = stop
     arguments = [str(tmp_path / "store"), str(clips), str(tmp_path)]
@@ -81,7 +81,7 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     saved = checkpoint.latest(tmp_path / "parts" / "steps")
     assert saved is not None and saved.step == 5 and saved.state["sharded"] and saved.state["processes"] == 2
     assert len(list(saved.path.glob("net.*.safetensors"))) == 2
-    parts = learn.run(tiny(clips, **common), tmp_path / "parts")
+    parts = Learn(out=tmp_path / "parts", settings=tiny(clips, **common)).run()
 
     one, other = losses_of(tmp_path / "whole"), losses_of(tmp_path / "parts")
     off = {step: abs(one[step] - other[step]) / one[step] for step in (3, 4, 5, 6)}
@@ -169,8 +169,8 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
 
 def test_portions_and_recomputing_change_nothing(clips, tmp_path):
     common = {"batch_frames": 8, "log_every": 1, "steps": 3}
-    learn.run(tiny(clips, **common), tmp_path / "plain")
-    learn.run(tiny(clips, **common, accumulate=2, recompute=True), tmp_path / "portions")
+    Learn(out=tmp_path / "plain", settings=tiny(clips, **common)).run()
+    Learn(out=tmp_path / "portions", settings=tiny(clips, **common, accumulate=2, recompute=True)).run()
     plain, portions = losses_of(tmp_path / "plain"), losses_of(tmp_path / "portions")
     assert all(portions[step] == pytest.approx(plain[step], rel=SAME) for step in (1, 2, 3))
 

@@ -26,10 +26,13 @@ from mudg.data.scene import read_scene
 from mudg.models.mdm.model import BatchPart, LossSettings
 from mudg.models.published import files as published_files
 from mudg.models.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
-from mudg.stages import convert, fuse, learn, synthesize
+from mudg.stages import convert, learn, synthesize
 from mudg.stages.config import FuseConfig, LearnConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
+from mudg.steps.fuse import Fuse
+from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Synthesize
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +49,7 @@ def converted(tmp_path_factory):
 def street(tmp_path_factory):
     root = tmp_path_factory.mktemp("street")
     ToyStreet(times=[0.1 * n for n in range(5)]).write(root / "scene", labels=False, width=72, height=48)
-    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     return root
 
 
@@ -61,7 +64,7 @@ def corner(clip):
 @pytest.mark.slow
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the result."""
-    one = learn.run(published_settings(converted, clips, steps=1, batch_frames=4), tmp_path / "one")
+    one = Learn(out=tmp_path / "one", settings=published_settings(converted, clips, steps=1, batch_frames=4)).run()
     large = write_clips(tmp_path / "large", 36, 32, points=True)
     config = published_settings(
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
@@ -70,7 +73,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     first, start = (published_files.load(folder).state_dict() for folder in (converted, one))
     assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
-    two = learn.run(config, tmp_path / "two")
+    two = Learn(out=tmp_path / "two", settings=config).run()
     last = published_files.load(two)
     end = last.state_dict()
     trained = {name for name in first if name.startswith(("net.", "image_tokens."))}
@@ -87,7 +90,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
     made = read_observations(
-        synthesize.run(view, street / "scene", street / "fuse", tmp_path / "made") / "front_shift+1.0"
+        Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "made", settings=view).run() / "front_shift+1.0"
     )
     assert len(made) == 5 and bool(torch.isfinite(made[4].rgb).all())
 
@@ -131,8 +134,8 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
 
 @pytest.mark.slow
 def test_portions_and_recomputing_change_nothing(converted, clips, tmp_path):
-    learn.run(published_settings(converted, clips), tmp_path / "plain")
-    learn.run(published_settings(converted, clips, accumulate=2, recompute=True), tmp_path / "portions")
+    Learn(out=tmp_path / "plain", settings=published_settings(converted, clips)).run()
+    Learn(out=tmp_path / "portions", settings=published_settings(converted, clips, accumulate=2, recompute=True)).run()
     plain, portions = losses_of(tmp_path / "plain"), losses_of(tmp_path / "portions")
     assert all(portions[step] == pytest.approx(plain[step], rel=SAME) for step in (1, 2))
 
@@ -141,7 +144,7 @@ def test_portions_and_recomputing_change_nothing(converted, clips, tmp_path):
 def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     """ddp, then fsdp from the checkpoint that ddp wrote, with frozen layers."""
     common = {"frozen": "temporal_transformers", "steps": 3}
-    learn.run(published_settings(converted, clips, **common), tmp_path / "one")
+    Learn(out=tmp_path / "one", settings=published_settings(converted, clips, **common)).run()
     script = str(Path(__file__).with_name("learn_published_together.py"))
     arguments = [str(tmp_path / "store"), str(converted), str(clips), str(tmp_path / "both")]
     both = [
@@ -177,7 +180,7 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
     monkeypatch.setattr(PublishedMDM, "encode_condition", watched)
     monkeypatch.setattr(PublishedMDM, "velocity_loss", noted)
     with pytest.raises(KeyboardInterrupt):
-        learn.run(published_settings(converted, clips, reference_dropout=0.8), tmp_path / "run")
+        Learn(out=tmp_path / "run", settings=published_settings(converted, clips, reference_dropout=0.8)).run()
     assert given and not any(given)
     assert dropped == [pytest.approx(0.8)]
     assert ContextDropout.for_reference(0.2) == PAPER_DROPOUT
@@ -212,16 +215,16 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
         with pytest.raises(
             UsageError, match=r"exactly the length(.|\n)*--data.window 4 --optimizer.full-window-share 1"
         ):
-            learn.run(published_settings(converted, clips, **wrong), tmp_path / "run")
+            Learn(out=tmp_path / "run", settings=published_settings(converted, clips, **wrong)).run()
     with pytest.raises(UsageError, match="multiples of 4"):
-        learn.run(published_settings(converted, clips, width=50), tmp_path / "run")
+        Learn(out=tmp_path / "run", settings=published_settings(converted, clips, width=50)).run()
     with pytest.raises(UsageError, match="cannot be changed"):
-        learn.run(published_settings(converted, clips, widths=(16, 32, 64)), tmp_path / "run")
+        Learn(out=tmp_path / "run", settings=published_settings(converted, clips, widths=(16, 32, 64))).run()
     with pytest.raises(UsageError, match="without a refiner"):
-        learn.run(published_settings(converted, clips, frozen="denoiser"), tmp_path / "refiner")
+        Learn(out=tmp_path / "refiner", settings=published_settings(converted, clips, frozen="denoiser")).run()
     warped = write_clips(tmp_path / "warped", 32, 32)
     with pytest.raises(InputError, match="warped images"):
-        learn.run(published_settings(converted, warped), tmp_path / "other")
+        Learn(out=tmp_path / "other", settings=published_settings(converted, warped)).run()
 
 
 # clips ----------------------------------------------------------------------------------------------------------------
@@ -300,7 +303,7 @@ def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path
     config = published_settings(
         converted, "", scenes=(source,), stride=4, held_out_every=0, width=32, height=32, steps=1, batch_frames=4
     )
-    made = learn.run(config, tmp_path / "run")
+    made = Learn(out=tmp_path / "run", settings=config).run()
     index = json.loads((tmp_path / "run" / "clips" / from_log.INDEX).read_text())["rules"]
     assert (index["width"], index["height"], index["published"]) == (32, 32, True)
     assert "the first image as condition" in (made / "MODEL_CARD.md").read_text()

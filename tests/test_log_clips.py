@@ -19,11 +19,12 @@ from mudg.data.clips.from_city import HELD_OUT
 from mudg.data.clips.from_log import LogClipRules, LogSource
 from mudg.data.scene import SceneWriter, photographs, read_image, read_label, read_points, read_scene
 from mudg.models.mdm.model import MDM
-from mudg.stages import fuse, learn
 from mudg.stages.adapting import lessons
 from mudg.stages.config import AdaptConfig, FuseConfig, LearnConfig
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
+from mudg.steps.fuse import Fuse
+from mudg.steps.learn import Learn
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
 FRAMES = 16
@@ -60,7 +61,7 @@ def log(tmp_path_factory):
     root = tmp_path_factory.mktemp("log")
     street = ToyStreet(car_start=(12.0, 3.0), car_velocity=(2.0, 0.0), times=[0.1 * n for n in range(FRAMES)])
     street.write(root / "scene", width=120, height=60)
-    fuse.run(FuseConfig(min_object_points=1), root / "scene", root / "fuse")
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig(min_object_points=1)).run()
     return street, LogSource(root / "scene", root / "fuse")
 
 
@@ -156,7 +157,7 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
 
 def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     small = write_clips(tmp_path / "clips")
-    first = learn.run(tiny(small, steps=1), tmp_path / "first")
+    first = Learn(out=tmp_path / "first", settings=tiny(small, steps=1)).run()
     run = tmp_path / "run"
     run.mkdir()
     for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
@@ -165,7 +166,7 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
         "", start=str(first), scenes=(str(run),), steps=2, score_every=1, log_every=1, stride=2, held_out_every=4, window=4,
         width=64, height=32,
     )  # fmt: skip
-    made = learn.run(config, tmp_path / "tuned")
+    made = Learn(out=tmp_path / "tuned", settings=config).run()
     index = json.loads((tmp_path / "tuned" / "clips" / "log_clips.json").read_text())
     assert index["rules"]["width"] == 64 and index["rules"]["height"] == 32  # the camera's aspect of 2
     card = (made / "MODEL_CARD.md").read_text()
@@ -178,7 +179,7 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     with pytest.raises(UsageError, match="other logs or settings"):
         from_log.claim_folder(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):
-        learn.run(tiny("", start=str(first), scenes=(str(tmp_path),)), tmp_path / "none")
+        Learn(out=tmp_path / "none", settings=tiny("", start=str(first), scenes=(str(tmp_path),))).run()
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +202,7 @@ def annotated(tmp_path_factory):
             }  # fmt: skip
             writer.copy_frame(bare, frame, labels)
         writer.finish()
-    fuse.run(FuseConfig(min_object_points=1), root / "scene", root / "fuse")
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig(min_object_points=1)).run()
     return street, LogSource(root / "scene", root / "fuse")
 
 

@@ -32,17 +32,8 @@ from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.stages import (
-    annotate,
     convert,
-    fit,
-    fuse,
     ingest,
-    learn,
-    render,
-    run,
-    score,
-    score_truth,
-    synthesize,
 )
 from mudg.stages.batches.listed import ListedRun, run_listed
 from mudg.stages.batches.plan import Entry
@@ -57,6 +48,17 @@ from mudg.stages.config import (
     ScoreConfig,
     SynthesizeConfig,
 )
+from mudg.steps import pipeline
+from mudg.steps.annotate import Annotate
+from mudg.steps.convert import Convert
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
+from mudg.steps.learn import Learn
+from mudg.steps.render import RenderViews
+from mudg.steps.run import Run
+from mudg.steps.score import DrawTruth, Score
+from mudg.steps.synthesize import Synthesize
 
 SMALL = MDMConfig(
     widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4, embed_width=16,
@@ -76,12 +78,12 @@ class Verb:
 
 def _ingest(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     config = IngestConfig(test_every=v + 1, poses=str(g.get("poses", "")), workers=1, contact_sheet=False)
-    return ingest.run(config, g["log"], out, overwrite=o)
+    return Ingest(log=g["log"], out=out, overwrite=o, settings=config).run()
 
 
 def _annotate(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     config = AnnotateConfig(labeller="geometry", sweeps=v, processes=1, weights=str(g.get("weights", "")))
-    return annotate.run(config, g["plain scene"], out, overwrite=o)
+    return Annotate(scene=g["plain scene"], out=out, overwrite=o, settings=config).run()
 
 
 def _synthesize(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
@@ -89,26 +91,26 @@ def _synthesize(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
         cameras=("front",), shifts_m=(1.0, -1.0), model=str(g["model"]), steps=v, width_px=48, full_size=False, precision="float32",
         processes=1,
     )  # fmt: skip
-    return synthesize.run(config, g["scene"], g["fused"], out, fitted=g["fitted"], overwrite=o)
+    return Synthesize(scene=g["scene"], fused=g["fused"], fitted=g["fitted"], out=out, overwrite=o, settings=config).run()
 
 
 def _fit(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     config = fit_config(method="mudg_s", iterations=6, seed=v, start__gaussians=200, checkpoint_every=2, preview_every=3)
-    return fit.run(config, g["scene"], g["fused"], out, observations=g["views"], overwrite=o)
+    return Fit(scene=g["scene"], fused=g["fused"], observations=(g["views"],), out=out, overwrite=o, settings=config).run()
 
 
 def _score(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     config = ScoreConfig(width_px=24 * v, perceptual_views=0)
-    return score.run(config, g["scene"], {"a": g["views"]}, out, fused=g["fused"], truth=None, overwrite=o)
+    return Score(scene=g["scene"], fused=g["fused"], views={"a": g["views"]}, truth=None, out=out, overwrite=o, settings=config).run()
 
 
 def _bench(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     return bench.run("mdm", BenchConfig(model=str(g["model"]), seed=v, precision="float32", threads=1), out, overwrite=o)
 
 
-def _paths(scene: Path, v: int) -> list[Any]:
+def _paths(scene: Path, v: int) -> tuple[Any, ...]:
     loaded = read_scene(scene)
-    return [trajectory.recorded(loaded, "front"), trajectory.shifted(loaded, "front", float(v))]
+    return trajectory.recorded(loaded, "front"), trajectory.shifted(loaded, "front", float(v))
 
 
 VERBS: dict[str, Verb] = {
@@ -116,31 +118,39 @@ VERBS: dict[str, Verb] = {
     "ingest a scene": Verb(lambda g, *rest: _ingest({"log": g["scene"]}, *rest), ("scene",)),
     "ingest a zip": Verb(lambda g, *rest: _ingest({"log": g["zip"]}, *rest), ("zip",)),
     "annotate": Verb(_annotate, ("plain scene", "weights")),
-    "fuse": Verb(lambda g, out, v, o: fuse.run(FuseConfig(voxel_m=0.1 * v), g["scene"], out, overwrite=o), ("scene",)),
+    "fuse": Verb(lambda g, out, v, o: Fuse(
+        scene=g["scene"], out=out, overwrite=o, settings=FuseConfig(voxel_m=0.1 * v)
+    ).run(), ("scene",)),
     "learn": Verb(
-        lambda g, out, v, o: learn.run(tiny(g["clips"], seed=v), out, overwrite=o), ("clips",)
+        lambda g, out, v, o: Learn(out=out, overwrite=o, settings=tiny(g["clips"], seed=v)).run(), ("clips",)
     ),
     "synthesize": Verb(_synthesize, ("scene", "fused", "model", "fitted")),
     "fit": Verb(_fit, ("scene", "fused", "views")),
     "render": Verb(
-        lambda g, out, v, o: render.run(RenderConfig(shifts_m=(0.0, v)), g["scene"], g["fitted"], out, overwrite=o),
+        lambda g, out, v, o: RenderViews(
+            scene=g["scene"], model=g["fitted"], out=out, overwrite=o, settings=RenderConfig(shifts_m=(0.0, v))
+        ).run(),
         ("scene", "fitted"),
     ),
     "score": Verb(_score, ("scene", "views", "fused")),
     "truth": Verb(
-        lambda g, out, v, o: score_truth.write_truth(g["city"], _paths(g["city"], v), out, overwrite=o), ("city",)
+        lambda g, out, v, o: DrawTruth(scene=g["city"], trajectories=_paths(g["city"], v), out=out, overwrite=o).run(), ("city",)
     ),
     "film": Verb(
-        lambda g, out, v, o: page.film(
-            {"truth": g["views"], **({"b": g["views"]} if v == 2 else {})}, _paths(g["scene"], 1), out, overwrite=o
-        ),
+        lambda g, out, v, o: page.Film(
+            views={"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})}, paths=_paths(g["scene"], 1), out=out, overwrite=o
+        ).run(),
         ("views",),
     ),
     "fill": Verb(
-        lambda g, out, v, o: chain.write_fill(g["scene"], g["fused"], _paths(g["scene"], v), out, overwrite=o), ("scene", "fused")
+        lambda g, out, v, o: chain.FillViews(
+            scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v), out=out, overwrite=o
+        ).run(), ("scene", "fused")
     ),
     "exact": Verb(
-        lambda g, out, v, o: chain.write_exact(g["views"], _paths(g["scene"], 1)[: 3 - v], out, overwrite=o), ("views",)
+        lambda g, out, v, o: chain.ExactViews(
+            truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v], out=out, overwrite=o
+        ).run(), ("views",)
     ),
     "bench": Verb(_bench, ("model",)),
 }  # fmt: skip
@@ -154,14 +164,14 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     street = ToyStreet(times=[0.0, 0.1])
     street.write(root / "plain", width=60, height=40, labels=False)
     given |= {"plain scene": root / "plain", "log": kitti_folders.write_raw_drive(root / "day"), "clips": write_clips(root / "clips")}
-    given["fused"] = fuse.run(FuseConfig(), given["scene"], root / "fused")
+    given["fused"] = Fuse(scene=given["scene"], out=root / "fused", settings=FuseConfig()).run()
     given["views"] = toy_views.write_views(given["scene"], root / "views", "a", (0.0, 1.0))
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
-    given["fitted"] = fit.run(config, given["scene"], given["fused"], root / "fitted")
+    given["fitted"] = Fit(scene=given["scene"], fused=given["fused"], out=root / "fitted", settings=config).run()
     torch.manual_seed(0)
     files.save(MDM(SMALL), root / "model", "", {})
     given["model"] = root / "model"
-    given["city"] = ingest.run(IngestConfig(city=CITY, contact_sheet=False), ingest.CITY, root / "city")
+    given["city"] = Ingest(log=ingest.CITY, out=root / "city", settings=IngestConfig(city=CITY, contact_sheet=False)).run()
     return given
 
 
@@ -230,10 +240,10 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
         listed.write_text(text)
         before = tree(tmp_path)
         with pytest.raises(UsageError, match="an input"):
-            fuse.run_many(FuseConfig(), listed, out, jobs=1, overwrite=True)
+            Fuse(list=listed, out=out, jobs=1, overwrite=True, settings=FuseConfig()).run()
         assert tree(tmp_path) == before
     with pytest.raises(UsageError, match="an input"):
-        fuse.run_many(FuseConfig(), scenes, scenes, jobs=1, overwrite=True)
+        Fuse(list=scenes, out=scenes, jobs=1, overwrite=True, settings=FuseConfig()).run()
     (tmp_path / "status.json").write_text("scenes/a\n")
     entries = [Entry("c", str(scenes / "a"))]
     for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
@@ -247,7 +257,7 @@ def test_files_of_a_log_that_lie_beside_it_count(world: dict[str, Path], tmp_pat
     drive, calibration = tmp_path / "day" / world["log"].name, tmp_path / "day" / "calib_cam_to_cam.txt"
     assert calibration.is_file()
     with pytest.raises(UsageError, match="is also an input"):
-        ingest.run(IngestConfig(), drive, calibration, overwrite=True)
+        Ingest(log=drive, out=calibration, overwrite=True, settings=IngestConfig()).run()
 
 
 def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(world: dict[str, Path], tmp_path: Path) -> None:
@@ -255,11 +265,11 @@ def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(wor
     shutil.copytree(world["clips"], out / "clips")
     for clips in (out, out / "steps", tmp_path, out / "clips" / "deep"):
         with pytest.raises(UsageError, match="an input"):
-            learn.run(tiny(clips), out)
+            Learn(out=out, settings=tiny(clips)).run()
     with pytest.raises(UsageError, match="an input"):
-        learn.run(tiny(out / "clips"), out, overwrite=True)
+        Learn(out=out, overwrite=True, settings=tiny(out / "clips")).run()
     with pytest.raises(UsageError, match="something else"):  # they are not from here
-        learn.run(tiny(out / "clips"), out)
+        Learn(out=out, settings=tiny(out / "clips")).run()
     assert len(tree(out)) == len(tree(world["clips"]))
 
 
@@ -270,10 +280,10 @@ def test_the_chain_never_writes_into_its_log(world: dict[str, Path], tmp_path: P
     for path in given.values():
         for out in (path, path.parent, *([path / "out"] if path.is_dir() else [])):
             with pytest.raises(UsageError, match="an input"):
-                run.run_chain(RunConfig(), str(path), out, overwrite=overwrite)
+                Run(source=str(path), out=out, overwrite=overwrite, settings=RunConfig()).run()
     config = dataclasses.replace(RunConfig(), synthesize=SynthesizeConfig(model=str(given["scene"])))
     with pytest.raises(UsageError, match=r"synthesize\.model"):
-        run.run_chain(config, "city", given["scene"].parent, overwrite=overwrite)
+        Run(source="city", out=given["scene"].parent, overwrite=overwrite, settings=config).run()
     assert tree(tmp_path) == before
 
 
@@ -289,18 +299,18 @@ def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
         reached.append(scene)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "_steps", stop)
+    monkeypatch.setattr(pipeline, "steps_of", stop)
     for overwrite in (False, True):
         with pytest.raises(KeyboardInterrupt):
-            run.run_chain(RunConfig(), out / "scene", out, overwrite=overwrite)
+            Run(source=out / "scene", out=out, overwrite=overwrite, settings=RunConfig()).run()
     assert reached == [out / "scene"] * 2
     assert before.items() <= tree(out).items()
     (out / "run.json").unlink()
     (out / "mine.md").write_text("mine")
     with pytest.raises(UsageError, match="do not belong to this run"):
-        run.run_chain(RunConfig(), out / "scene", out, overwrite=True)
+        Run(source=out / "scene", out=out, overwrite=True, settings=RunConfig()).run()
     with pytest.raises(UsageError, match="an input"):
-        run.run_chain(RunConfig(), out / "scene", out / "scene", overwrite=True)
+        Run(source=out / "scene", out=out / "scene", overwrite=True, settings=RunConfig()).run()
 
 
 def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: dict[str, Path], tmp_path: Path) -> None:
@@ -308,7 +318,7 @@ def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: dict[st
     before = tree(tmp_path)
     for overwrite in (False, True):
         with pytest.raises(UsageError, match="do not belong to this run"):
-            run.run_chain(RunConfig(), "city", folder, overwrite=overwrite)
+            Run(source="city", out=folder, overwrite=overwrite, settings=RunConfig()).run()
     assert tree(tmp_path) == before
 
 
@@ -409,10 +419,10 @@ def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
 
 
 def test_a_failed_import_over_another_scene_leaves_that(world: dict[str, Path], tmp_path: Path) -> None:
-    out = ingest.run(IngestConfig(test_every=2, contact_sheet=False), world["log"], tmp_path / "out")
+    out = Ingest(log=world["log"], out=tmp_path / "out", settings=IngestConfig(test_every=2, contact_sheet=False)).run()
     before = tree(out)
     with pytest.raises(UsageError, match="no such camera"):
-        ingest.run(IngestConfig(cameras=("frnt",), contact_sheet=False), world["log"], out, overwrite=True)
+        Ingest(log=world["log"], out=out, overwrite=True, settings=IngestConfig(cameras=("frnt",), contact_sheet=False)).run()
     assert tree(tmp_path / "out") == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
@@ -428,7 +438,7 @@ def test_a_user_file_in_the_folder_of_a_failing_import_stays(
 
     monkeypatch.setattr(ingest, "_make", fail)
     with pytest.raises(KeyboardInterrupt):
-        ingest.run(IngestConfig(), world["log"], out)
+        Ingest(log=world["log"], out=out, settings=IngestConfig()).run()
     assert [p.name for p in out.iterdir()] == ["mine.md"]
 
 
@@ -445,11 +455,11 @@ def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(tmp_path: Path,
     before = tree(to)
     for out in (tmp_path, tmp_path / "512.ckpt"):
         with pytest.raises(UsageError, match="an input"):
-            convert.run(ConvertConfig(), tmp_path / "512.ckpt", out, overwrite=True)
+            Convert(checkpoint=tmp_path / "512.ckpt", to=out, overwrite=True, settings=ConvertConfig()).run()
     (tmp_path / "fit").mkdir()
     store.write_json(tmp_path / "fit" / "model.json", {"schema": 1, "nodes": []})
     with pytest.raises(UsageError, match="do not belong to a model"):
-        convert.run(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "fit", overwrite=True)
+        Convert(checkpoint=tmp_path / "512.ckpt", to=tmp_path / "fit", overwrite=True, settings=ConvertConfig()).run()
     with counted_writes(monkeypatch, stop_at=2), pytest.raises(KeyboardInterrupt):
         converted("float16", overwrite=True)
     assert tree(to) == before

@@ -15,8 +15,8 @@ from mudg.base.errors import InputError
 from mudg.base.types import EgoPath, Photo, Scene, Source, SweepPoints
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.data.scene import SceneWriter, image_point_classes, read_points, read_scene
-from mudg.stages import annotate
 from mudg.stages.config import AnnotateConfig
+from mudg.steps.annotate import Annotate
 
 pytestmark = roundtrip.needs_native
 PARKED = ToyStreet(panel_x=9.0, car_start=(12.0, 4.0))
@@ -47,7 +47,7 @@ def test_scenes_and_copies_keep_classes_and_scenes_without_have_none(tmp_path: P
     expected = classed(PARKED, 0.1)[1].classes
     assert expected is not None
     assert (read_points(scene, scene.sweeps[1]).classes == expected).all()
-    annotate.run(AnnotateConfig(), tmp_path / "scene", tmp_path / "labelled")
+    Annotate(scene=tmp_path / "scene", out=tmp_path / "labelled", settings=AnnotateConfig()).run()
     labelled = read_scene(tmp_path / "labelled")
     assert "semantics" in labelled.frames[0].labels
     assert (read_points(labelled, labelled.sweeps[1]).classes == expected).all()

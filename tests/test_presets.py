@@ -13,8 +13,9 @@ from mudg import app
 from mudg.base import config as configuration
 from mudg.base.errors import InputError, UsageError
 from mudg.stages import config as stage_config
-from mudg.stages import run
 from mudg.stages.config import PRESETS, PresetName, RunConfig, run_preset
+from mudg.steps import pipeline
+from mudg.steps.run import Run
 
 NAMES = get_args(PresetName)
 
@@ -89,17 +90,17 @@ def test_help_names_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) 
 def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:
     out, paper = tmp_path / "out", run_preset("paper")
     with pytest.raises(UsageError, match="published-type diffusion model"):
-        run.run_chain(paper, "city", out)
+        Run(source="city", out=out, settings=paper).run()
     with pytest.raises(UsageError, match="published-type diffusion model"):
         mudg.run("city", out=out, preset="paper")
     weights = replace(paper.fit, virtual=replace(paper.fit.virtual, lpips_weights=str(tmp_path / "lpips.safetensors")))
     other = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model="embedded"))
     with pytest.raises(UsageError, match="published-type models only"):
-        run.run_chain(other, "city", out)
+        Run(source="city", out=out, settings=other).run()
     with pytest.raises(InputError, match="no diffusion model here"):
-        run.run_chain(
-            replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none"))), "city", out
-        )
+        Run(
+            source="city", out=out, settings=replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none")))
+        ).run()
     with pytest.raises(UsageError, match="LPIPS needs a weight file"):
         mudg.run("city", out=out, preset="paper", synthesize={"model": "embedded"})
     assert not out.exists()
@@ -107,7 +108,7 @@ def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_
 
 def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[RunConfig] = []
-    monkeypatch.setattr(run, "run_chain", lambda config, *_args, **_named: seen.append(config) or {})
+    monkeypatch.setattr(pipeline, "run_chain", lambda config, *_args, **_named: seen.append(config) or {})
     mudg.run("city", out=tmp_path, preset="quality", fit={"iterations": 9})
     mudg.run("city", out=tmp_path, fast=True)
     mudg.run("city", out=tmp_path, seed=4)
@@ -120,6 +121,6 @@ def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_published_fit_starts_from_nothing_with_all_steps() -> None:
     config = run_preset("paper")
-    plain, guided = run.fits_of(config.fit, config.continue_fit)
+    plain, guided = pipeline.fits_of(config.fit, config.continue_fit)
     assert plain.iterations == guided.iterations == 30_000
-    assert run.fits_of(config.fit)[1].iterations == 15_000
+    assert pipeline.fits_of(config.fit)[1].iterations == 15_000

@@ -26,9 +26,11 @@ from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderC
 from mudg.models.published.model import PublishedConfig, WorkSplit
 from mudg.models.published.resampler import Resampler, ResamplerConfig
 from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
-from mudg.stages import convert, fuse, synthesize
+from mudg.stages import convert, synthesize
 from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
 from mudg.stages.learning import memory_plan
+from mudg.steps.fuse import Fuse
+from mudg.steps.synthesize import Synthesize
 
 GOLDEN = Path(__file__).parent / "golden"
 TOLERANCE = 1e-4
@@ -438,7 +440,7 @@ def street(tmp_path_factory):
     """A made-up street as a scene, its fused cloud, and a converted tiny model."""
     root = tmp_path_factory.mktemp("street")
     ToyStreet(times=[0.1 * n for n in range(6)]).write(root / "scene", width=48, height=32)
-    fuse.run(FuseConfig(), root / "scene", root / "fused")
+    Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
     torch.save({"state_dict": tiny_checkpoint()}, root / "512.ckpt")
     convert.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
     return root
@@ -457,7 +459,7 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
             "forward",
             lambda net, x, t, label, *rest: (passes.append(label.tolist()), forward(net, x, t, label, *rest))[1],
         )
-        out = synthesize.run(config, street / "scene", street / "fused", tmp_path / "out")
+        out = Synthesize(scene=street / "scene", fused=street / "fused", out=tmp_path / "out", settings=config).run()
     found = read_observations(out / "front_shift+1.0")
     assert len(found) == 6
     assert passes == [[0, 500, 1] * 2] * 12
@@ -468,7 +470,9 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
         assert bool(((depth >= 0) & (depth <= 100)).all())
         assert bool(found[n].mask.all()) == (n > 0)  # frame 0 shows the recorded place, not the shifted one
     with pytest.raises(ResourceError, match="memory budget"):
-        synthesize.run(replace(config, memory_budget_gb=0.5), street / "scene", street / "fused", tmp_path / "none")
+        Synthesize(
+            scene=street / "scene", fused=street / "fused", out=tmp_path / "none", settings=replace(config, memory_budget_gb=0.5)
+        ).run()
 
 
 def test_the_released_resizing(street):
@@ -507,12 +511,12 @@ def test_the_reference_fits_only_where_it_was_taken(street):
 def test_short_trajectories_are_refused_in_words(street, tmp_path):
     root = tmp_path
     ToyStreet(times=[0.1 * n for n in range(3)]).write(root / "scene", width=48, height=32)
-    fuse.run(FuseConfig(), root / "scene", root / "fused")
+    Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
     config = SynthesizeConfig(
         cameras=("front",), shifts_m=(1.0,), model=str(street / "model"), steps=20, precision="float32"
     )
     with pytest.raises(UsageError, match="fixed number of frames"):
-        synthesize.run(config, root / "scene", root / "fused", root / "out")
+        Synthesize(scene=root / "scene", fused=root / "fused", out=root / "out", settings=config).run()
 
 
 def test_models_come_back_as_they_were(street, model):

@@ -19,8 +19,9 @@ from mudg.data.cloudfile import read_fused
 from mudg.data.scene import read_scene
 from mudg.models.diffusion import SampleRequest
 from mudg.models.published.model import PublishedLatents
-from mudg.stages import fuse, ingest
 from mudg.stages.config import FuseConfig, IngestConfig
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
 
 FRAMES = 4
 DISTORTIONS = ((0.5, 0.0), (0.8, 0.0), (1.25, 0.0), (2.0, 0.0), (1.0, 3.0), (1.0, -1.0))
@@ -105,8 +106,8 @@ def test_a_surface_painted_at_a_wrong_distance_is_not_trusted(exact, monkeypatch
 def kitti(shared_data, tmp_path_factory):
     """A recorded drive and its fused cloud."""
     root = tmp_path_factory.mktemp("kitti")
-    ingest.run(IngestConfig(contact_sheet=False), shared_data("kitti_2011_09_26"), root / "scene")
-    fuse.run(FuseConfig(), root / "scene", root / "fuse")
+    Ingest(log=shared_data("kitti_2011_09_26"), out=root / "scene", settings=IngestConfig(contact_sheet=False)).run()
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     return read_scene(root / "scene"), read_fused(root / "fuse")
 
 

@@ -24,13 +24,15 @@ from mudg.models.radiance import march as marching
 from mudg.models.radiance import sampling
 from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggregated
 from mudg.models.radiance.march import Budget, RayDraws, Rays
-from mudg.stages import fit, render, synthesize
 from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
 from mudg.stages.config.radiance import RadianceConfig
 from mudg.stages.radiance import loop
 from mudg.stages.radiance.pictures import flow_colors
 from mudg.stages.radiance.rays import extent_of, lidar_rays, view_rays
 from mudg.stages.radiance.storage import load_field
+from mudg.steps.fit import Fit
+from mudg.steps.render import RenderViews
+from mudg.steps.synthesize import Synthesize
 
 TINY = {
     "method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4,
@@ -211,7 +213,7 @@ def world(tmp_path_factory) -> Path:
     write_scene(root / "scene", frames=4, width=24, height=16)
     write_scene(root / "bare", frames=4, width=24, height=16, tracks=False)
     write_fused(root / "fuse", fused_cloud(4), {})
-    fit.run(fit_config(**TINY), root / "scene", None, root / "fit")
+    Fit(scene=root / "scene", out=root / "fit", settings=fit_config(**TINY)).run()
     return root
 
 
@@ -224,7 +226,7 @@ def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
 
 
 def test_boxes_are_not_read(world, tmp_path):
-    fit.run(fit_config(**TINY), world / "bare", None, tmp_path / "bare")
+    Fit(scene=world / "bare", out=tmp_path / "bare", settings=fit_config(**TINY)).run()
     assert same(parameters(world / "fit"), parameters(tmp_path / "bare"))
 
 
@@ -239,9 +241,9 @@ def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
 
     monkeypatch.setattr(loop, "take_step", stopped)
     with pytest.raises(KeyboardInterrupt):
-        fit.run(fit_config(**TINY), world / "scene", None, tmp_path / "fit")
+        Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY)).run()
     monkeypatch.setattr(loop, "take_step", lambda state, config, step: (calls.append(step), real(state, config, step))[1])
-    fit.run(fit_config(**TINY), world / "scene", None, tmp_path / "fit")
+    Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY)).run()
     assert calls == [1, 2, 3, 4, 5, 6, 5, 6, 7, 8]
     assert same(parameters(world / "fit"), parameters(tmp_path / "fit"))
     assert not (tmp_path / "fit" / "steps").exists()
@@ -283,14 +285,18 @@ def test_what_is_not_finite_never_reaches_the_parameters(world):
 
 
 def test_renders_as_observations_without_classes(world, tmp_path):
-    out = render.run(RenderConfig(shifts_m=(0.0, 2.0), video=True), world / "scene", world / "fit", tmp_path / "render")
+    out = RenderViews(
+        scene=world / "scene", model=world / "fit", out=tmp_path / "render", settings=RenderConfig(shifts_m=(0.0, 2.0), video=True)
+    ).run()
     seen = read_observations(out / "front_shift+2.0")[1]
     assert seen.source == "emernerf" and seen.semantics is None
     assert seen.rgb.shape == (3, 16, 24) and torch.isfinite(seen.rgb).all()
     known = seen.depth[torch.isfinite(seen.depth)]
     assert len(known) and (known > 0).all()
     with pytest.raises(UsageError, match="no objects"):
-        render.run(RenderConfig(remove_tracks=("car",)), world / "scene", world / "fit", tmp_path / "other")
+        RenderViews(
+            scene=world / "scene", model=world / "fit", out=tmp_path / "other", settings=RenderConfig(remove_tracks=("car",))
+        ).run()
 
 
 def test_saved_field_is_the_fitted_one(world):
@@ -308,13 +314,15 @@ def test_what_needs_gaussians_refuses_a_radiance_field(world, tmp_path):
     with pytest.raises(InputError, match="radiance field"):
         FittedScene.read(world / "fit", "cpu")
     with pytest.raises(InputError, match="radiance field"):
-        synthesize.run(SynthesizeConfig(), world / "scene", world / "fuse", tmp_path / "virtual", fitted=world / "fit")
+        Synthesize(
+            scene=world / "scene", fused=world / "fuse", fitted=world / "fit", out=tmp_path / "virtual", settings=SynthesizeConfig()
+        ).run()
     with pytest.raises(InputError, match="no radiance field"):
         load_field_of_gaussians(tmp_path)
     with pytest.raises(UsageError, match="cannot go on"):
-        fit.run(fit_config(**TINY), world / "scene", None, tmp_path / "more", start=world / "fit")
+        Fit(scene=world / "scene", start_from=world / "fit", out=tmp_path / "more", settings=fit_config(**TINY)).run()
     with pytest.raises(UsageError, match="needs fused clouds"):
-        fit.run(fit_config(method="gs3d"), world / "scene", None, tmp_path / "gs3d")
+        Fit(scene=world / "scene", out=tmp_path / "gs3d", settings=fit_config(method="gs3d")).run()
 
 
 def load_field_of_gaussians(folder: Path) -> None:

@@ -21,6 +21,8 @@ from mudg.data.observations import ObservationWriter, list_observation_sets, rea
 from mudg.data.scene import read_scene
 from mudg.stages import fit, render
 from mudg.stages.config import RenderConfig
+from mudg.steps.fit import Fit
+from mudg.steps.render import RenderViews
 
 FRAMES = 4
 SHIFTS = (0.0, 2.0, -3.0)
@@ -32,13 +34,15 @@ def world(tmp_path_factory) -> dict[str, Path]:
     write_scene(root / "scene", frames=FRAMES, cameras=("front", "left"), width=60, height=40)
     write_fused(root / "fuse", fused_cloud(FRAMES), {})
     config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
-    fit.run(config, root / "scene", root / "fuse", root / "fit")
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=config).run()
     return {"scene": root / "scene", "model": root / "fit"}
 
 
 @pytest.fixture(scope="module")
 def rendered(world, tmp_path_factory) -> Path:
-    return render.run(RenderConfig(shifts_m=SHIFTS), world["scene"], world["model"], tmp_path_factory.mktemp("r") / "out")
+    return RenderViews(
+        scene=world["scene"], model=world["model"], out=tmp_path_factory.mktemp("r") / "out", settings=RenderConfig(shifts_m=SHIFTS)
+    ).run()
 
 
 def test_one_folder_and_video_per_trajectory(rendered):
@@ -73,7 +77,7 @@ def test_views_lie_where_the_trajectory_says(rendered):
 
 def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_path, monkeypatch):
     config = RenderConfig(shifts_m=(0.0, 2.0), video=False)
-    whole = render.run(config, world["scene"], world["model"], tmp_path / "whole")
+    whole = RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "whole", settings=config).run()
     real, calls, numbers = render.render_view, [], itertools.count(1)
 
     def stop_at_third(*arguments):  # threads call
@@ -85,11 +89,11 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
 
     monkeypatch.setattr(render, "render_view", stop_at_third)
     with pytest.raises(KeyboardInterrupt):
-        render.run(config, world["scene"], world["model"], tmp_path / "parts")
+        RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run()
     kept = len(list((tmp_path / "parts").rglob("*.safetensors")))
     assert kept == 2
     calls.clear()
-    parts = render.run(config, world["scene"], world["model"], tmp_path / "parts")
+    parts = RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run()
     assert len(calls) == 2 * FRAMES - kept
     for name in ("front_recorded", "front_shift+2.0"):
         first, second = read_observations(whole / name), read_observations(parts / name)
@@ -97,13 +101,13 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
             for field in ("rgb", "depth", "semantics", "confidence"):
                 assert torch.equal(*(torch.nan_to_num(getattr(o[index], field)) for o in (first, second))), (name, index, field)
     calls.clear()
-    assert render.run(config, world["scene"], world["model"], tmp_path / "parts") == parts
+    assert RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run() == parts
     assert not calls
 
 
 def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     config = RenderConfig(shifts_m=(0.0,), remove_tracks=("car",), video=False)
-    folder = render.run(config, world["scene"], world["model"], tmp_path / "out")
+    folder = RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "out", settings=config).run()
     seen = read_observations(folder / "front_recorded")[1]
     with_car = fit.render_view(fit.load_model(world["model"]), seen.view, RasterConfig())
     uv, _ = geometry.project(seen.view, (car_pose(seen.view.time_s)[:3, 3] - [0, 0, CAR_SIZE[2] / 4])[None])
@@ -111,7 +115,9 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     assert with_car.semantics[row, column] == ID["car"]
     assert seen.semantics[row, column] != ID["car"]
     with pytest.raises(UsageError, match="no dynamic object 'tram'"):
-        render.run(RenderConfig(remove_tracks=("tram",)), world["scene"], world["model"], tmp_path / "other")
+        RenderViews(
+            scene=world["scene"], model=world["model"], out=tmp_path / "other", settings=RenderConfig(remove_tracks=("tram",))
+        ).run()
 
 
 def test_any_camera_any_width(world):

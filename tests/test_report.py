@@ -28,8 +28,8 @@ from mudg.data.edits import read_edits
 from mudg.pages import html as report_html
 from mudg.pages import page as report_page
 from mudg.pages import run_report
-from mudg.stages import score
 from mudg.stages.config import ScoreConfig
+from mudg.steps.score import Score
 
 
 def dark(share: float) -> Any:
@@ -50,7 +50,7 @@ def finished_run(out: Path) -> Path:
     guided = toy_views.write_views(scene, out / "render" / "mudg_s", "mudg_s", (0.0, 2.0), dark(0.9))
     virtual = toy_views.write_views(scene, out / "synthesize", "mudg_r", (2.0,), grey)
     methods = {"street_gaussians": plain, "mudg_r": virtual, "mudg_s": guided}
-    score.run(ScoreConfig(perceptual_views=1), scene, methods, out / "score")
+    Score(scene=scene, views=methods, out=out / "score", settings=ScoreConfig(perceptual_views=1)).run()
     steps = {"ingest": {"state": "complete", "seconds": 1.5}, "score": {"state": "complete", "seconds": 3.0}}
     ledger = {
         "asked": {"source": "<toy> & co"},

@@ -9,7 +9,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from test_edit_run import run  # noqa: F401
@@ -21,31 +20,17 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.benchmarks import run as bench
 from mudg.data.importers import FORMATS
-from mudg.stages import adapt, annotate, fit, fuse, render, score, synthesize
+from mudg.stages import score
+from mudg.steps.engine import Result, paths_of
 
 
 @pytest.fixture
-def called(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """What the steps are called with, in place of doing it."""
-    calls: list[Any] = []
-
-    def note(*args: Any, **named: Any) -> Path:
-        calls.append((args[1:], named))
-        return Path("made")
-
-    for stage in (adapt, annotate, fit, fuse, render, synthesize, score):
-        monkeypatch.setattr(stage, "run", note)
+def called(monkeypatch: pytest.MonkeyPatch) -> list[Result]:
+    """The steps as they would be carried out, in place of doing it."""
+    calls: list[Result] = []
+    monkeypatch.setattr(Result, "act", lambda step: calls.append(step) or Path("made"))
     monkeypatch.setattr(score, "summary_table", lambda _out: "")
     return calls
-
-
-def paths_of(call: Any, folder: Path) -> list[str]:
-    """Paths below a folder that a step was called with."""
-    args, named = call
-    views = [path for one in args if isinstance(one, dict) for path in one.values()]
-    several = [path for one in named.values() if isinstance(one, tuple) for path in one]
-    flat = [one for one in (*args, *named.values(), *views, *several) if isinstance(one, Path)]
-    return [one.relative_to(folder).as_posix() for one in flat if one.is_relative_to(folder)]
 
 
 @pytest.mark.parametrize(
@@ -64,14 +49,14 @@ def paths_of(call: Any, folder: Path) -> list[str]:
         ("score RUN --views mudg_s=RUN mudg_r=RUN --out OUT", ["scene", "render/mudg_s", "synthesize"]),
     ],
 )
-def test_a_run_stands_for_its_parts(line: str, paths: list[str], called: list[Any], tmp_path: Path) -> None:
+def test_a_run_stands_for_its_parts(line: str, paths: list[str], called: list[Result], tmp_path: Path) -> None:
     folder = tmp_path / "run"
     for name in ("scene/scene.json", "fuse/fuse.json", "fit/street_gaussians/model.json", "fit/mudg_s/model.json"):
         store.write_json(folder / name, {})
     for name in ("synthesize", "render/mudg_s"):
         store.make_folder(folder / name)
     assert app.main(line.replace("RUN", str(folder)).replace("OUT", str(tmp_path / "out")).split()) == 0
-    assert paths_of(called[0], folder) == paths
+    assert [path.relative_to(folder).as_posix() for path in paths_of(called[0]).values() if path is not None] == paths
 
 
 def test_a_run_in_python_doctor_and_render(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811

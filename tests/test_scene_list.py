@@ -19,6 +19,7 @@ from mudg.data.clips.sources import FolderOfShards, ShardCache, StreamedShards
 from mudg.stages import learn
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning.scene_list import ListedScene, ListedShards, SceneList, is_list, read_list
+from mudg.steps.learn import Learn
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +136,7 @@ def test_bad_scenes_are_left_out_up_to_a_limit(clips, tmp_path, capsys):
 
 def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
     text = listed_folder(clips, tmp_path)
-    learn.run(from_list(text), tmp_path / "whole")
+    Learn(out=tmp_path / "whole", settings=from_list(text)).run()
     draw = learn.draw_clips
 
     def stopped_by_the_user(config, folder, step, *rest):
@@ -145,9 +146,9 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
 
     monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
     with pytest.raises(KeyboardInterrupt):
-        learn.run(from_list(text), tmp_path / "parts")
+        Learn(out=tmp_path / "parts", settings=from_list(text)).run()
     monkeypatch.setattr(learn, "draw_clips", draw)
-    learn.run(from_list(text), tmp_path / "parts")
+    Learn(out=tmp_path / "parts", settings=from_list(text)).run()
     assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "parts")
     names = [p.name for p in (tmp_path / "whole" / "model").glob("*.safetensors")]
     assert names and all(
@@ -156,17 +157,19 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
     )
     assert not (tmp_path / "whole" / "cache").exists()
     with pytest.raises(UsageError, match="lies in an input"):
-        learn.run(from_list(text), tmp_path / "scenes" / "1" / "out")
+        Learn(out=tmp_path / "scenes" / "1" / "out", settings=from_list(text)).run()
     with pytest.raises(UsageError, match="list of scenes says"):
-        learn.run(tiny(clips, scenes=(text,)), tmp_path / "both")
+        Learn(out=tmp_path / "both", settings=tiny(clips, scenes=(text,))).run()
 
 
 # streamed clips -------------------------------------------------------------------------------------------------------
 
 
 def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
-    learn.run(tiny(clips, log_every=1, steps=2), tmp_path / "local")
-    learn.run(tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6), tmp_path / "streamed")
+    Learn(out=tmp_path / "local", settings=tiny(clips, log_every=1, steps=2)).run()
+    Learn(
+        out=tmp_path / "streamed", settings=tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6)
+    ).run()
     assert losses_of(tmp_path / "local") == losses_of(tmp_path / "streamed")
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1  # all others had to go
     assert json.loads((tmp_path / "local" / "metrics.json").read_text()) == json.loads(

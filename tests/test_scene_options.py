@@ -26,6 +26,7 @@ from mudg.stages import fit
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.start import mirrored_points
+from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
@@ -84,8 +85,8 @@ def fitted_bytes(folder: Path) -> dict[str, bytes]:
 
 def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, tmp_path, monkeypatch):
     config = settings()
-    arguments = (config, world["scene"], world["fuse"])
-    whole = fit.run(*arguments, tmp_path / "whole", observations=world["virtual"])
+    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole", settings=config)
+    whole = step.run()
     adam_step = fit.adam_step
 
     def ctrl_c(model, step, *rest):
@@ -95,9 +96,9 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
 
     monkeypatch.setattr(fit, "adam_step", ctrl_c)
     with pytest.raises(KeyboardInterrupt):
-        fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+        replace(step, out=tmp_path / "parts").run()
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    parts = fit.run(*arguments, tmp_path / "parts", observations=world["virtual"])
+    parts = replace(step, out=tmp_path / "parts").run()
     assert fitted_bytes(parts) == fitted_bytes(whole)
     assert set(fitted_bytes(whole)) == {
         "gaussians.safetensors",
@@ -114,9 +115,9 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
 
 
 def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
-    folder = fit.run(
-        settings(iterations=6), world["scene"], world["fuse"], tmp_path / "fit", observations=world["virtual"]
-    )
+    folder = Fit(
+        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "fit", settings=settings(iterations=6)
+    ).run()
     model = fit.load_model(folder)
     fit.save_model(model, tmp_path)
     again = fit.load_model(tmp_path)
@@ -143,7 +144,9 @@ def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(worl
             appearance__virtual=own,
             virtual__beside=False,  # where the recorded path gives steps away, it suffers most
         )
-        folder = fit.run(config, world["scene"], world["fuse"], tmp_path / str(own), observations=tmp_path / "dark")
+        folder = Fit(
+            scene=world["scene"], fused=world["fuse"], observations=(tmp_path / "dark",), out=tmp_path / str(own), settings=config
+        ).run()
         view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
         psnr[own] = metrics.psnr(fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb)
     assert psnr[True] > psnr[False] + 0.3, psnr
@@ -155,9 +158,9 @@ def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(worl
 def test_everything_on_without_tracks_and_with_one_frame(tmp_path):
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(1, semantics=False).static, {}), {})
-    folder = fit.run(
-        settings("street_gaussians", iterations=4), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit"
-    )
+    folder = Fit(
+        scene=tmp_path / "scene", fused=tmp_path / "fuse", out=tmp_path / "fit", settings=settings("street_gaussians", iterations=4)
+    ).run()
     view = view_at(0.0, camera(width=48, height=32))
     seen, exact = fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb
     plain = exact.mean((1, 2), keepdim=True).expand_as(exact)
@@ -173,9 +176,9 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
     points = fused_cloud(2).objects["car"]
     few = PointCloud(points.xyz[:3], points.rgb[:3], "object", None)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(2).static, {"car": few}), {})
-    folder = fit.run(
-        settings("street_gaussians", iterations=8), tmp_path / "scene", tmp_path / "fuse", tmp_path / "fit"
-    )
+    folder = Fit(
+        scene=tmp_path / "scene", fused=tmp_path / "fuse", out=tmp_path / "fit", settings=settings("street_gaussians", iterations=8)
+    ).run()
     model = fit.load_model(folder)
     moving = model.table.labels["node"] > 0
     assert (compose(model, 0.3).opacity[moving] > 0).any()
@@ -211,7 +214,7 @@ def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
 
     monkeypatch.setattr(fit_views.StoredView, "as_tensors", poisoned)
     with pytest.raises(NumericsError, match=r"view front/000002, step \d"):
-        fit.run(settings("street_gaussians"), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings("street_gaussians")).run()
 
 
 def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):

@@ -19,6 +19,7 @@ from mudg.models import featnets
 from mudg.pages import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
+from mudg.steps.score import Score
 
 PLAIN = ScoreConfig(perceptual_views=0)
 
@@ -46,7 +47,7 @@ def scene(tmp_path: Path) -> Path:
 def test_known_colour_error_gives_known_psnr(tmp_path: Path, scene: Path) -> None:
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), brighter(5))
     worse = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), brighter(20))
-    out = score.run(PLAIN, scene, {"street_gaussians": plain, "mudg_s": worse}, tmp_path / "score")
+    out = Score(scene=scene, views={"street_gaussians": plain, "mudg_s": worse}, out=tmp_path / "score", settings=PLAIN).run()
     document = store.read_json(out / "metrics.json")
     for method, step in (("street_gaussians", 5), ("mudg_s", 20)):
         assert value(document, method, "front_recorded", "psnr") == pytest.approx(20 * math.log10(255 / step), abs=1e-4)
@@ -59,7 +60,7 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
         return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), spoil_training_frames)
-    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
     assert document["results"][0]["views"] == 2
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
@@ -67,14 +68,14 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
 def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
     assert document["results"][0]["views"] == 4
     assert any("No frame was held out" in rule for rule in document["rules"])
 
 
 def test_a_recorded_log_has_no_truth_off_its_path(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, 2.0))
-    out = score.run(PLAIN, scene, {"a": views}, tmp_path / "score")
+    out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run()
     document = store.read_json(out / "metrics.json")
     assert document["truth"] == "recorded"
     assert value(document, "a", "front_shift+2.0", "psnr") == score_tables.NO_TRUTH
@@ -88,7 +89,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
         return dataclasses.replace(seen, depth=None, semantics=None)
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), color_only)
-    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
     assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
     assert value(document, "a", "front_recorded", "miou") == "not produced"
     assert value(document, "a", "front_recorded", "psnr") == 100.0
@@ -97,7 +98,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
 def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
     assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
     assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
 
@@ -107,7 +108,7 @@ def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
         return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), no_depth_anywhere)
-    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
     true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
     expected = float(np.mean((80.0 - true) / true))
     assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
@@ -128,7 +129,7 @@ def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path,
 
     small = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), half)
     full = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,))
-    out = score.run(PLAIN, scene, {"a": small, "b": full}, tmp_path / "score")
+    out = Score(scene=scene, views={"a": small, "b": full}, out=tmp_path / "score", settings=PLAIN).run()
     document = store.read_json(out / "metrics.json")
     course = document["trajectories"][0]
     assert (course["width"], course["height"]) == (toy_views.WIDTH, toy_views.HEIGHT)
@@ -151,7 +152,7 @@ def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Pa
     index["observations"] = index["observations"][:3]
     store.write_json(part / "front_recorded" / "observations.json", index)
     document = store.read_json(
-        score.run(PLAIN, scene, {"a": full, "b": part}, tmp_path / "score") / "metrics.json"
+        Score(scene=scene, views={"a": full, "b": part}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
     )
     assert document["trajectories"][0]["views"] == 3
     assert {r["views"] for r in document["results"]} == {1}
@@ -162,31 +163,31 @@ def test_methods_must_stand_in_the_same_place(tmp_path: Path, scene: Path) -> No
     there = toy_views.write_views(scene, tmp_path / "b", "b", (3.0,))
     (there / "front_shift+3.0").rename(there / "front_shift+2.0")
     with pytest.raises(InputError, match="different positions"):
-        score.run(PLAIN, scene, {"a": here, "b": there}, tmp_path / "score")
+        Score(scene=scene, views={"a": here, "b": there}, out=tmp_path / "score", settings=PLAIN).run()
 
 
 def test_nothing_to_score_is_said(tmp_path: Path, scene: Path) -> None:
     with pytest.raises(UsageError):
-        score.run(PLAIN, scene, {}, tmp_path / "score")
+        Score(scene=scene, views={}, out=tmp_path / "score", settings=PLAIN).run()
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="none of the folders"):
-        score.run(PLAIN, scene, {"a": tmp_path / "empty"}, tmp_path / "score2")
+        Score(scene=scene, views={"a": tmp_path / "empty"}, out=tmp_path / "score2", settings=PLAIN).run()
 
 
 def test_a_finished_score_is_reused_and_another_configuration_refused(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    out = score.run(PLAIN, scene, {"a": views}, tmp_path / "score")
+    out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run()
     before = (out / "metrics.json").stat().st_mtime_ns
-    score.run(PLAIN, scene, {"a": views}, out)
+    Score(scene=scene, views={"a": views}, out=out, settings=PLAIN).run()
     assert (out / "metrics.json").stat().st_mtime_ns == before
     with pytest.raises(UsageError, match="another configuration"):
-        score.run(ScoreConfig(width_px=24, perceptual_views=0), scene, {"a": views}, out)
+        Score(scene=scene, views={"a": views}, out=out, settings=ScoreConfig(width_px=24, perceptual_views=0)).run()
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, -3.0), brighter(9))
-    first = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "one")
-    second = score.run(ScoreConfig(), scene, {"a": views}, tmp_path / "two")
+    first = Score(scene=scene, views={"a": views}, out=tmp_path / "one", settings=ScoreConfig()).run()
+    second = Score(scene=scene, views={"a": views}, out=tmp_path / "two", settings=ScoreConfig()).run()
     for name in ("metrics.json", "metrics.md", "errors/front_recorded.png"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
 
@@ -194,10 +195,14 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
 def test_large_images_score_as_small_ones_do(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views one after the other and methods beside each other, perceptual distances in bands; the images are not halved."""
     views = {name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name))) for name in ("a", "bb")}
-    small = store.read_json(score.run(ScoreConfig(), scene, views, tmp_path / "small") / "metrics.json")["results"]
+    small = store.read_json(Score(
+        scene=scene, views=views, out=tmp_path / "small", settings=ScoreConfig()
+    ).run() / "metrics.json")["results"]
     monkeypatch.setattr(score, "WHOLE_PIXELS", 0)
     monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    large = store.read_json(score.run(ScoreConfig(), scene, views, tmp_path / "large") / "metrics.json")["results"]
+    large = store.read_json(Score(
+        scene=scene, views=views, out=tmp_path / "large", settings=ScoreConfig()
+    ).run() / "metrics.json")["results"]
     assert [one["method"] for one in small] == [one["method"] for one in large] == ["a", "bb"]
     for one, other in zip(small, large, strict=True):
         assert isinstance(one["values"]["perceptual"], float)
@@ -273,5 +278,5 @@ def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), lambda _i, seen: dataclasses.replace(
         seen, depth=torch.full_like(seen.depth, 12.0)
     ))  # fmt: skip
-    document = store.read_json(score.run(PLAIN, scene, {"a": views}, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m

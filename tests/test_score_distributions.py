@@ -22,6 +22,7 @@ from mudg.stages import score
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring import distributions
 from mudg.stages.scoring.distributions import Distributions, FeatureFiles, ImageSet, TrajectorySets
+from mudg.steps.score import Score
 
 CPU = torch.device("cpu")
 
@@ -65,7 +66,7 @@ def scored(tmp_path: Path, weights: Path, shifts: tuple[float, ...] = (0.0, 2.0)
         "b": toy_views.write_views(scene, tmp_path / "b", "b", shifts, darker),
     }
     config = ScoreConfig(fid_weights=str(weights), perceptual_views=0, error_pictures=False, **more)
-    out = score.run(config, scene, methods, tmp_path / "score")
+    out = Score(scene=scene, views=methods, out=tmp_path / "score", settings=config).run()
     return out, store.read_json(out / "metrics.json")
 
 
@@ -177,7 +178,7 @@ def test_large_sets_have_an_error_and_an_extrapolation(monkeypatch: pytest.Monke
 def test_without_weights_the_tables_name_the_flag(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    out = score.run(ScoreConfig(perceptual_views=0), scene, {"a": views}, tmp_path / "score")
+    out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(perceptual_views=0)).run()
     document = store.read_json(out / "metrics.json")
     assert {values(document, "front_recorded", name)["a"] for name in ("fid", "kid", "fvd", "lpips")} == {
         "not computed"
@@ -206,15 +207,15 @@ def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}
     with pytest.raises(InputError, match="nothing.pth"):
-        score.run(ScoreConfig(fid_weights=str(tmp_path / "nothing.pth")), scene, views, tmp_path / "score")
+        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(tmp_path / "nothing.pth"))).run()
     other = tmp_path / "other.safetensors"
     store.write_safetensors(other, {"conv1.weight": np.zeros(3, np.float32)})
     with pytest.raises(InputError, match="Conv2d_1a_3x3.conv.weight"):
-        score.run(ScoreConfig(fid_weights=str(other)), scene, views, tmp_path / "score")
+        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(other))).run()
     assert not (tmp_path / "score" / "truth").exists()
     inside = tmp_path / "score" / "weights.safetensors"
     with pytest.raises(UsageError, match="fid-weights"):
-        score.run(ScoreConfig(fid_weights=str(inside)), scene, views, tmp_path / "score")
+        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(inside))).run()
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(".pth", marks=pytest.mark.slow), ".safetensors"])

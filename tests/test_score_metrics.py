@@ -23,6 +23,7 @@ from mudg.models.mdm import files
 from mudg.pages import score_tables
 from mudg.stages import score
 from mudg.stages.config import ScoreConfig
+from mudg.steps.score import Score
 
 
 def pair(**given) -> Pair:
@@ -279,7 +280,7 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
 
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
     views = {"a": plain, "b": toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), grey)}
-    document = store.read_json(score.run(ScoreConfig(), scene, views, tmp_path / "score") / "metrics.json")
+    document = store.read_json(Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig()).run() / "metrics.json")
     values = {r["method"]: r["values"] for r in document["results"]}
     assert values["a"]["perceptual"] == pytest.approx(0.0, abs=1e-6)
     assert values["b"]["perceptual"] > 0.05
@@ -287,7 +288,7 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
     assert values["a"]["lpips"] == "not computed"
     store.write_safetensors(tmp_path / "lpips.safetensors", {name: v.numpy() for name, v in lpips_state().items()})
     config = ScoreConfig(perceptual_views=0, lpips_weights=str(tmp_path / "lpips.safetensors"))
-    other = store.read_json(score.run(config, scene, views, tmp_path / "other") / "metrics.json")
+    other = store.read_json(Score(scene=scene, views=views, out=tmp_path / "other", settings=config).run() / "metrics.json")
     values = {r["method"]: r["values"] for r in other["results"]}
     assert values["a"]["perceptual"] == score_tables.NOT_REQUESTED
     assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]

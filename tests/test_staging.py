@@ -112,10 +112,10 @@ def test_stopped_in_a_transfer_the_same_command_goes_on(
             raise PermissionError("refused")
         return found(self, *args, **options)
 
-    from mudg.stages import fuse
+    from mudg.steps.fuse import Fuse
 
-    run = fuse.run
-    monkeypatch.setattr(fuse, "run", lambda *args, **options: computed.append(1) or run(*args, **options))
+    act = Fuse.act
+    monkeypatch.setattr(Fuse, "act", lambda step: computed.append(1) or act(step))
     with monkeypatch.context() as patch:
         patch.setattr(type(files), fails, failing)
         code, _, said = command("fuse", "memory://bucket/city", "--out", "memory://bucket/fused")

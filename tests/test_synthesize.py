@@ -20,10 +20,13 @@ from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.extended import extended
 from mudg.models.mdm.model import MDM, MDMConfig
-from mudg.stages import fit, fuse, synthesize
+from mudg.stages import fit, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.fitting.planes import FAR_M, render_planes
 from mudg.stages.fitting.rendering import render_condition
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.synthesize import Synthesize
 
 FRAMES = 7
 
@@ -33,7 +36,7 @@ def world(tmp_path_factory):
     """A made-up street as a scene, its fused cloud, and a tiny model with a window of four frames."""
     root = tmp_path_factory.mktemp("street")
     ToyStreet(times=[0.1 * n for n in range(FRAMES)]).write(root / "scene", width=96, height=64)
-    fuse.run(FuseConfig(), root / "scene", root / "fused")
+    Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
     torch.manual_seed(0)
     model = MDM(
         MDMConfig(
@@ -52,7 +55,7 @@ def world(tmp_path_factory):
 
 def made(world, out, **changes):
     root, config = world
-    return synthesize.run(replace(config, **changes), root / "scene", root / "fused", out)
+    return Synthesize(scene=root / "scene", fused=root / "fused", out=out, settings=replace(config, **changes)).run()
 
 
 def frames_of(path):
@@ -265,7 +268,7 @@ def fitted(world, tmp_path_factory):
     root, _ = world
     folder = tmp_path_factory.mktemp("fitted")
     settings = fit_config(method="street_gaussians", iterations=4, start__gaussians=900)
-    scene = fit.run(settings, root / "scene", root / "fused", folder / "fit")
+    scene = Fit(scene=root / "scene", fused=root / "fused", out=folder / "fit", settings=settings).run()
     before = files.load(root / "model")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
     files.save(extended(before, grown), folder / "model", "", {})
@@ -299,7 +302,7 @@ def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkey
     monkeypatch.setattr(MDM, "sample", lambda self, condition, *rest: (given.append(condition), sample(self, condition, *rest))[1])
     monkeypatch.setattr(MDM, "finish", lambda self, clip, fine, **more: (finished.append(fine), finish(self, clip, fine, **more))[1])
     settings = replace(config, model=str(model), full_size=True, steps=1)
-    out = synthesize.run(settings, root / "scene", root / "fused", tmp_path / "out", fitted=scene)
+    out = Synthesize(scene=root / "scene", fused=root / "fused", fitted=scene, out=tmp_path / "out", settings=settings).run()
     made = frames_of(out / "front_shift+1.0")
     assert len(made) == FRAMES and made[0].rgb.shape == (3, 64, 96)
     assert all(c.renders is not None and c.renders.color.shape[-2:] == (32, 48) for c in given)
@@ -307,14 +310,16 @@ def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkey
     assert len(finished) == len(given) > 1
     sky = made[0].semantics == palette.ID["sky"]
     assert bool((torch.isnan(made[0].depth[0]) | ~sky | finished[0].valid[0, 0]).all())
-    plain = synthesize.run(settings, root / "scene", root / "fused", tmp_path / "plain")  # works without a fit, too
+    plain = Synthesize(
+        scene=root / "scene", fused=root / "fused", out=tmp_path / "plain", settings=settings
+    ).run()  # works without a fit, too
     assert not torch.equal(made[2].rgb, frames_of(plain / "front_shift+1.0")[2].rgb)
 
 
 def test_a_model_without_renders_takes_no_fitted_scene(world, fitted, tmp_path):
     root, config = world
     with pytest.raises(UsageError, match="not trained with renders"):
-        synthesize.run(config, root / "scene", root / "fused", tmp_path / "out", fitted=fitted[0])
+        Synthesize(scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=config).run()
     assert not (tmp_path / "out").exists()
 
 
@@ -322,4 +327,4 @@ def test_a_condition_with_parts_switched_off_has_no_renders(world, fitted, tmp_p
     root, config = world
     settings = replace(config, model=str(fitted[1]), condition="points")
     with pytest.raises(UsageError, match="switched off"):
-        synthesize.run(settings, root / "scene", root / "fused", tmp_path / "out", fitted=fitted[0])
+        Synthesize(scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=settings).run()

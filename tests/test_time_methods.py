@@ -44,6 +44,8 @@ from mudg.stages.fitting import views as fit_views
 from mudg.stages.fitting.recipes import RECIPES
 from mudg.stages.radiance import loop as radiance_loop
 from mudg.stages.radiance import rays
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
 
 SIZE, FRAMES = (60, 40), 6
 OWN = {
@@ -395,7 +397,7 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
         adam_step(model, *rest)
 
     monkeypatch.setattr(fit, "adam_step", spy)
-    folder = fit.run(settings(method, iterations=60), world["scene"], world["fuse"], tmp_path / "fit")
+    folder = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, iterations=60)).run()
     assert OWN[method] <= reached
     model = fit.load_model(folder)
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
@@ -411,7 +413,7 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
 @pytest.mark.parametrize("method", RECIPES)
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, method):
     config, stops = settings(method, iterations=14), [11]
-    whole = fit.run(config, world["scene"], world["fuse"], tmp_path / "whole")
+    whole = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "whole", settings=config).run()
     adam_step = fit.adam_step
 
     def stopped(model, step, *rest):
@@ -422,10 +424,12 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     monkeypatch.setattr(fit, "adam_step", stopped)
     while stops:
         with pytest.raises(KeyboardInterrupt):
-            fit.run(config, world["scene"], world["fuse"], tmp_path / "parts")
+            Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config).run()
         stops.pop(0)
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    assert fitted_bytes(fit.run(config, world["scene"], world["fuse"], tmp_path / "parts")) == fitted_bytes(whole)
+    assert fitted_bytes(Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config
+    ).run()) == fitted_bytes(whole)
 
 
 @pytest.fixture(scope="module")
@@ -434,13 +438,15 @@ def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("tracks")
     for name, changes in {"tracked": {}, "untracked": {"tracks": False}, "garbled": {"garbled": True}}.items():
         write_scene(root / name, frames=4, cameras=("front", "left"), width=SIZE[0], height=SIZE[1], dark=("left",), **changes)
-        fuse.run(FuseConfig(min_object_points=5, voxel_m=0.05), root / name, root / f"{name}-fuse")
+        Fuse(scene=root / name, out=root / f"{name}-fuse", settings=FuseConfig(min_object_points=5, voxel_m=0.05)).run()
     return {path.name: path for path in root.iterdir()}
 
 
 def fitted_to(worlds: dict[str, Path], name: str, out: Path, method: str, iterations: int = 4) -> Path:
     small = SMALL_RADIANCE if method == "emernerf" else {}
-    return fit.run(settings(method, iterations=iterations, **small), worlds[name], worlds[f"{name}-fuse"], out / name)
+    return Fit(
+        scene=worlds[name], fused=worlds[f"{name}-fuse"], out=out / name, settings=settings(method, iterations=iterations, **small)
+    ).run()
 
 
 def test_fusing_depends_on_tracks(tracked_or_not):
@@ -504,7 +510,7 @@ def test_a_static_scene_starts_with_what_moved(tracked_or_not, tmp_path):
 
 
 def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_not, tmp_path):
-    fuse.run(FuseConfig(voxel_m=0.8, match_colors=False), tracked_or_not["tracked"], tmp_path / "coarse")
+    Fuse(scene=tracked_or_not["tracked"], out=tmp_path / "coarse", settings=FuseConfig(voxel_m=0.8, match_colors=False)).run()
     scene = read_scene(tracked_or_not["tracked"])
     fine, coarse = (fuse.fused_without_boxes(scene, folder) for folder in (tracked_or_not["tracked-fuse"], tmp_path / "coarse"))
     assert len(coarse.static) < len(fine.static) / 2
@@ -515,7 +521,7 @@ def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_
 @pytest.mark.parametrize("changes", [{"poses__learn": True}, {"objects__deformable": False}, {"loss__object_weight": 0.1}])
 def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
     with pytest.raises(UsageError, match="knows nothing of it"):
-        fit.run(settings(method, **changes), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, **changes)).run()
     assert not (tmp_path / "fit").exists()
 
 
@@ -523,20 +529,26 @@ def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_pat
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     for weight in RECIPES[method].own_weights:
         with pytest.raises(UsageError, match="published weights of its own"):
-            fit.run(settings(method, **{f"loss__{weight}": 0.33}), world["scene"], world["fuse"], tmp_path / "fit")
+            Fit(
+                scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, **{f"loss__{weight}": 0.33})
+            ).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
-        fit.run(settings(method, densify__kind="mcmc"), world["scene"], world["fuse"], tmp_path / "fit")
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, densify__kind="mcmc")).run()
     with pytest.raises(UsageError, match="cannot go on"):
-        fit.run(settings(method), world["scene"], world["fuse"], tmp_path / "fit", start=tmp_path / "other")
+        Fit(
+            scene=world["scene"], fused=world["fuse"], start_from=tmp_path / "other", out=tmp_path / "fit", settings=settings(method)
+        ).run()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
     small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch", "hexplane__space": 4}
-    here = fit.run(settings(method, device="cpu", **small), world["scene"], world["fuse"], tmp_path / "here")
+    here = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "here", settings=settings(method, device="cpu", **small)).run()
     with pretend_device():
-        there = fit.run(settings(method, device="pretend", **small), world["scene"], world["fuse"], tmp_path / "there")
+        there = Fit(
+            scene=world["scene"], fused=world["fuse"], out=tmp_path / "there", settings=settings(method, device="pretend", **small)
+        ).run()
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
     pictures = [fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb for folder in (here, there)]
     assert metrics.psnr(*pictures) > 45.0

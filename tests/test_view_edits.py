@@ -28,7 +28,6 @@ from mudg.data.scene import read_scene
 from mudg.models.scene.edited import motion_of
 from mudg.models.scene.model import SceneModel
 from mudg.pages.viewer.facts import UNKNOWN, PageFacts, with_ground
-from mudg.stages import edit, render
 from mudg.stages.config import EditConfig, RenderConfig
 from mudg.stages.config.view import PageConfig
 from mudg.stages.editing.apply import street_left
@@ -40,6 +39,8 @@ from mudg.stages.viewing import edits as desk_module
 from mudg.stages.viewing import view
 from mudg.stages.viewing.edits import MARK, EditDesk, EditFiles, EditRequest, desk_for, place_for
 from mudg.stages.viewing.frames import FrameRequest, FrameSource
+from mudg.steps.edit import Edit
+from mudg.steps.render import RenderViews
 
 Toy = tuple[Path, Path, SceneModel]
 SCRIPT = "- move: {id: car-1, along_m: 1.5, left_m: 1, yaw_deg: 20}\n"
@@ -186,10 +187,10 @@ def test_saved_edits_are_rendered_and_carried_out_alike(toy: Toy, tmp_path: Path
     place, scene = tmp_path / "edits.yaml", toy[0] / "scene"
     said(desk_of(toy, place), SCRIPT, save=True)
     config = RenderConfig(shifts_m=(0.0,), video=False)
-    drawn = render.run(config, scene, toy[1], tmp_path / "drawn", edits=place)
-    made = edit.run(EditConfig(), toy[1], place, tmp_path / "made", scene=scene)
-    again = render.run(config, scene, made, tmp_path / "again")
-    plain = render.run(config, scene, toy[1], tmp_path / "plain")
+    drawn = RenderViews(scene=scene, model=toy[1], edits=place, out=tmp_path / "drawn", settings=config).run()
+    made = Edit(source=toy[1], script=place, scene=scene, out=tmp_path / "made", settings=EditConfig()).run()
+    again = RenderViews(scene=scene, model=made, out=tmp_path / "again", settings=config).run()
+    plain = RenderViews(scene=scene, model=toy[1], out=tmp_path / "plain", settings=config).run()
 
     def images(folder: Path) -> list[torch.Tensor]:
         seen = read_observations(folder / "front_recorded")

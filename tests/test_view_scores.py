@@ -22,9 +22,9 @@ from mudg.data.city import CityConfig, CityWorld, write_city
 from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_scene
 from mudg.pages import score_tables
-from mudg.stages import score, score_truth
 from mudg.stages.config import ScoreConfig
 from mudg.stages.scoring import detections
+from mudg.steps.score import DrawTruth, Score
 
 QUICK = ScoreConfig(perceptual_views=0, error_pictures=False)
 Change = Callable[[Observation], Observation]
@@ -78,7 +78,7 @@ def log_scores(log_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
         name: written(scene, folder / name, toy_world.truth, (0.0, 2.0), change)
         for name, change in {"right": None, "far": farther, "gray": gray}.items()
     }
-    out = score.run(QUICK, log_scene, methods, folder / "score")
+    out = Score(scene=log_scene, views=methods, out=folder / "score", settings=QUICK).run()
     return store.read_json(out / "metrics.json")
 
 
@@ -150,7 +150,10 @@ def test_nta_iou_from_a_file_of_boxes(
     scene = read_scene(log_scene)
     views = written(scene, tmp_path / "right", toy_world.truth, (2.0,))
     boxes = boxes_json(tmp_path / "boxes.json", scene, "right", moved, confidence, category)
-    out = score.run(dataclasses.replace(QUICK, detections=str(boxes)), log_scene, {"right": views, "other": views}, tmp_path / "score")
+    out = Score(
+        scene=log_scene, views={"right": views, "other": views}, out=tmp_path / "score",
+        settings=dataclasses.replace(QUICK, detections=str(boxes)),
+    ).run()  # fmt: skip
     document = store.read_json(out / "metrics.json")
     (row,) = (r for r in document["results"] if r["method"] == "right")
     assert row["values"]["nta_iou"] == pytest.approx(expected)
@@ -193,7 +196,10 @@ def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) ->
     views = written(read_scene(log_scene), tmp_path / "right", toy_world.truth, (2.0,))
     (tmp_path / "lanes").mkdir()
     with pytest.raises(InputError, match="no lane lines"):
-        score.run(dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes")), log_scene, {"right": views}, tmp_path / "score")
+        Score(
+            scene=log_scene, views={"right": views}, out=tmp_path / "score",
+            settings=dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes")),
+        ).run()  # fmt: skip
 
 
 def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
@@ -229,10 +235,10 @@ def city_run(city: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
             lanes = detections.lane_scores.lane_truth(view, world.lane_lines())
             target = folder / "lanes" / name / path.name / f"{number:06d}.png"
             store.write_image(target, (lanes & masks).astype(np.uint8) * 255)
-    truth = score_truth.write_truth(city, [path], folder / "drawn")
+    truth = DrawTruth(scene=city, trajectories=(path,), out=folder / "drawn").run()
     config = dataclasses.replace(QUICK, lanes=str(folder / "lanes"))
-    out = score.run(config, city, methods, folder / "score", truth=truth)
-    drawn = score.run(QUICK, city, methods, folder / "score_drawn")
+    out = Score(scene=city, views=methods, truth=truth, out=folder / "score", settings=config).run()
+    drawn = Score(scene=city, views=methods, out=folder / "score_drawn", settings=QUICK).run()
     stored, again = (store.read_json(o / "metrics.json") for o in (out, drawn))
     for name in ("agent_iou", "lane_iou", "lane_correlation", "warp_error", "lidar_abs_rel", "temporal_flickering"):
         close = pytest.approx(value(again, "right", path.name, name), abs=2e-2)  # stored truth has 8 bits

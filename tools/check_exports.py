@@ -35,9 +35,9 @@ from mudg.data.scene import read_points, read_scene
 from mudg.data.splats.cloud import SplatCloud
 from mudg.data.splats.formats import FORMATS, read_cloud
 from mudg.stages.config import ExportConfig
-from mudg.stages.exporting import export
 from mudg.stages.exporting.export import CAMERAS
 from mudg.stages.exporting.messages import SUFFIXES
+from mudg.steps.export import Export
 
 SINGLE = ("ply", "spz", "compressed-ply", "sog", "splat")
 FOREIGN = re.compile(r"'(metadata\.yaml|\w+\.json|mesh_ground\.ply)' in package .* unsupported extension")
@@ -98,10 +98,10 @@ def written(run: Path, out: Path) -> dict[str, Path]:
         if (of_log and not (run / "scene").is_dir()) or (name in ("rerun", "ncore") and not installed(name)):
             continue
         found[name] = out / f"{name}{suffix}"
-        export.run(ExportConfig(), name, run, found[name], overwrite=True)
+        Export(format=name, source=run, out=found[name], overwrite=True, settings=ExportConfig()).run()
     if installed("zstandard"):
         found["spz 4"] = out / "version4.spz"
-        export.run(ExportConfig(spz_version=4), "spz", run, found["spz 4"], overwrite=True)
+        Export(format="spz", source=run, out=found["spz 4"], overwrite=True, settings=ExportConfig(spz_version=4)).run()
     return found
 
 

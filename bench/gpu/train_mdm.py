@@ -19,9 +19,9 @@ from shared import device_of, finish, flags, work_folder
 
 from mudg.base import config as configuration
 from mudg.models.mdm import files
-from mudg.stages import learn
 from mudg.stages.config import LearnConfig
 from mudg.stages.config.learn import LearnCodec
+from mudg.steps.learn import Learn
 
 NO_LONGER = ("textures",)
 """Of the recipe: photographs that are not part of the repository, unless --textures names them."""
@@ -66,7 +66,7 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     if options.small:
         config = small(replace(config, steps=2))
     began = time.perf_counter()
-    model = learn.run(config, work_folder(options) / "learned")
+    model = Learn(out=work_folder(options) / "learned", settings=config).run()
     seconds = time.perf_counter() - began
     after, before = files.facts(model)["held_out"], files.facts("embedded")["held_out"]
     rows = [{"what": "training", "steps": config.steps, "seconds": seconds, "seconds per step": seconds / config.steps}]

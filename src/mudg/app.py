@@ -185,8 +185,6 @@ def parse(words: Sequence[str]) -> tuple[Step, Common]:
 
 def _run_verb(verb: str, words: Sequence[str]) -> tuple[dict[str, Any], bool]:
     """Run a verb; returns what it shows, and whether as JSON."""
-    from mudg.steps.step import perform
-
     step, common = parse(words)
     log.set_quiet(common.quiet)
     if verb not in ("doctor", "fuse"):  # they do without torch
@@ -197,7 +195,7 @@ def _run_verb(verb: str, words: Sequence[str]) -> tuple[dict[str, Any], bool]:
         processes.hold_life_line()
 
     def call(placed: Any) -> dict[str, Any]:
-        return placed.answer(perform(placed))
+        return placed.answer(placed.run())
 
     with _sigterm_interrupts():
         if any("://" in word for word in words) and not verb.startswith("batch"):  # whose workers stage in and out for every step

@@ -18,8 +18,8 @@ MAX_FILES_IN_STAGES = 16
 
 # Floor of each part of the package; an import may only reach a lower number, or its own part.
 FLOORS = {
-    "base": 1, "core": 2, "native": 2, "data": 3, "models": 3, "methods": 3.5, "pages": 3.8, "stages": 4, "benchmarks": 4.5,
-    "fitted": 4.8, "steps": 4.9,
+    "base": 1, "core": 2, "native": 2, "data": 3, "models": 3, "methods": 3.5, "pages": 3.8, "stages": 4, "fitted": 4.8, "steps": 4.9,
+    "benchmarks": 4.95,
     "app": 5, "__main__": 5, "__init__": 5,
 }  # fmt: skip
 
@@ -262,12 +262,12 @@ def test_only_the_store_opens_files_for_reading(package_dir: Path) -> None:
 
 
 def test_outputs_are_kept_apart_from_inputs(package_dir: Path) -> None:
-    """A verb's folder is opened after its inputs were compared with it; ``benchmarks/poses.py`` opens folders of its own result."""
+    """A verb's folder is opened after its inputs were compared with it; two open folders of their own results."""
     problems = []
     for name, tree in parsed(package_dir):
         opened = [call.lineno for call, function in calls(tree) if function.endswith("RunDir.open")]
         compared = [call.lineno for call, function in calls(tree) if function.endswith(("refuse_overlap", "_refuse_overlap"))]
-        if len(compared) < len(opened) and name != "benchmarks/poses.py":
+        if len(compared) < len(opened) and name not in ("benchmarks/poses.py", "stages/learning/city_fits.py"):
             problems.append(f"{name}:{opened[0]}: RunDir.open without refuse_overlap")
     refuse(problems)
 
@@ -437,8 +437,11 @@ def explained_once(tree: ast.Module) -> set[str]:
     return names
 
 
-STEP_METHODS = {"run", "answer", "required", "verb", "applies"}
-"""What every verb has: explained in `Step`."""
+STEP_METHODS = {
+    "act", "answer", "applies", "checked", "inputs", "is_file", "key_settings", "make", "output", "places", "prepare", "reads", "required",
+    "resulting", "run_parts", "settings_in_list", "verb",
+}  # fmt: skip
+"""What every verb has: explained in `Step` and `Result`."""
 
 
 def test_public_functions_are_annotated_and_documented(package_dir: Path) -> None:
@@ -447,7 +450,7 @@ def test_public_functions_are_annotated_and_documented(package_dir: Path) -> Non
         for node, is_method in public_definitions(tree):
             if node.name == "main" and name == "__main__.py":
                 continue
-            explained = explained_once(tree) | (STEP_METHODS if name.startswith("steps/") else set())
+            explained = explained_once(tree) | (STEP_METHODS if name.startswith(("steps/", "benchmarks/")) else set())
             if not ast.get_docstring(node) and not (is_method and node.name in explained):
                 problems.append(f"{name}:{node.lineno}: {node.name} has no docstring")
             if isinstance(node, ast.ClassDef):

@@ -66,6 +66,11 @@ class ResultFile:
             finally:
                 result._tidy()
 
+    @property
+    def path(self) -> Path:
+        """Where the file is made."""
+        return self.staged()
+
     def staged(self, form: Path | None = None) -> Path:
         """Where the content of a form is made."""
         form = form or self.out

@@ -150,11 +150,6 @@ class VerbOutput:
     files: tuple[str, ...]
 
 
-def below(folder: str, patterns: Sequence[str]) -> tuple[str, ...]:
-    """The patterns for a sub-folder (itself a pattern)."""
-    return tuple(f"{folder}/{pattern}" for pattern in patterns)
-
-
 def _matches(name: str, patterns: Sequence[str]) -> bool:
     parts = name.split("/")
     for pattern in patterns:
@@ -295,6 +290,7 @@ class RunDir:
         self._meter = Meter()
         self._earlier: Usage | None = None
         self._paths: dict[str, list[str]] = {}
+        self._ended = complete
         self._seen: Mapping[str, Any] = {}
         """What the folder's record said when it was opened."""
 
@@ -399,12 +395,16 @@ class RunDir:
         store.append_line(self.path / _LOG, store.json_text(fields, indent=None))
 
     def pause(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Record an interruption: time spent so far is kept, the lock released; the same command continues."""
+        """Record an interruption: time spent so far is kept, the lock released; the same command continues. Said once."""
+        if self._ended:
+            return
+        self._ended = True
         self._write_state("interrupted", summary or {})
         (self.path / _LOCK).unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Remove what this unfinished run made, and the folder if the run made it and nothing else is in it."""
+        self._ended = True
         with contextlib.suppress(OSError):  # an error brought us here, and that one is to be told
             remove_files(self.path, own_names(self._output, self.path))
             if self._made_folder:
@@ -421,6 +421,7 @@ class RunDir:
                 f"{self.path} holds files that {self.verb} did not make: {', '.join(sorted(set(names) - set(own))[:8])}"
             )
         store.write_manifest(self.path, own)
+        self._ended = True
         self._write_state("complete", summary or {})
         (self.path / _LOCK).unlink(missing_ok=True)
         if self.path != self.out:

@@ -8,27 +8,31 @@ OUT/repair/<step>  repaired renders on the way to the places of generated views 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from mudg.base import log, store
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
+from mudg.base import log
+from mudg.base.layout import OBSERVATION_FILES, below
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Trajectory
-from mudg.benchmarks.loop import step
+from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.rows import EXACT, FILL, LONGER, REPAIRED, Row, usual_fit
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, list_observation_sets, read_observations
+from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_scene
-from mudg.stages import fit, fuse, render, score, synthesize
+from mudg.stages import score
 from mudg.stages.config import BenchConfig, FitConfig, RenderConfig, SynthesizeConfig
-from mudg.stages.run import WITHOUT_DIFFUSION, fits_of
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.outputs import Output
+from mudg.steps.pipeline import WITHOUT_DIFFUSION, fits_of
+from mudg.steps.render import RenderViews
+from mudg.steps.synthesize import Synthesize
 
 REPAIR_STEPS: Final = 3
 """Steps in which repaired views move from the recorded path to the places of generated views."""
-_FILL_OUTPUT: Final = VerbOutput(FILL, 1, below("*", OBSERVATION_FILES))
-_EXACT_OUTPUT: Final = VerbOutput(EXACT, 1, below("*", OBSERVATION_FILES))
 
 
 @dataclass(frozen=True)
@@ -52,21 +56,22 @@ class Chain:
         """The clouds."""
         return self.out / "fuse"
 
-    def step(self, verb: Callable[..., Path], *inputs: Any, **settings: Any) -> Path:
-        """Run a verb, or reuse its result."""
-        return step(verb, *inputs, **settings, overwrite=self.overwrite)
+    def run(self, step: Output) -> Path:
+        """Run a step, or reuse its result."""
+        return run_step(replace(step, overwrite=self.overwrite))
 
     def fuse(self) -> Path:
         """Make the clouds."""
-        return self.step(fuse.run, self.config.fuse, self.scene, self.fused)
+        return self.run(Fuse(scene=self.scene, out=self.fused, settings=self.config.fuse))
 
     def generated(self, settings: SynthesizeConfig, out: Path, *, renders: bool) -> Path:
         """Views of the diffusion model; ``renders``: on top of those of the first fit."""
-        return self.step(synthesize.run, settings, self.scene, self.fused, out, fitted=self.first() if renders else None)
+        fitted = self.first() if renders else None
+        return self.run(Synthesize(scene=self.scene, fused=self.fused, fitted=fitted, out=out, settings=settings))
 
     def filled(self, paths: Sequence[Trajectory]) -> Path:
         """The fused points, holes filled, as views."""
-        return self.step(write_fill, self.scene, self.fused, paths, self.out / FILL)
+        return self.run(FillViews(scene=self.scene, fused=self.fused, paths=tuple(paths), out=self.out / FILL))
 
     def rendered(self, row: Row, virtual: Sequence[Path], drawn: RenderConfig, scene: Path | None = None) -> Path:
         """Views of a row's fit.
@@ -74,7 +79,8 @@ class Chain:
         Args:
             virtual: views that it learns from, if its method learns from such. drawn: which views. scene: with their places, if other.
         """
-        return self.step(render.run, drawn, scene or self.scene, self.fitted(row, virtual), self.out / "render" / row.name)
+        model, out = self.fitted(row, virtual), self.out / "render" / row.name
+        return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
 
     # ---- fits ----
 
@@ -109,14 +115,16 @@ class Chain:
         for number in range(1, REPAIR_STEPS + 1):
             views, last = self.out / "repair" / str(number), number == REPAIR_STEPS
             repaired = repair_settings(self.generator, number / REPAIR_STEPS)
-            self.step(synthesize.run, repaired, self.scene, self.fused, views, fitted=model)
+            self.run(Synthesize(scene=self.scene, fused=self.fused, fitted=model, out=views, settings=repaired))
             seen |= list_observation_sets(views)
             out = self.out / "fit" / name if last else self.out / "start" / f"{name}-{number}"
             model = self._fit(settings, out, tuple(seen.values()), self.first())
         return model
 
     def _fit(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
-        return self.step(fit.run, settings, self.scene, self.fused, out, observations=virtual, start=begun)
+        return self.run(Fit(
+            scene=self.scene, fused=self.fused, observations=tuple(virtual), start_from=begun, out=out, settings=settings
+        ))  # fmt: skip
 
 
 def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConfig:
@@ -128,36 +136,51 @@ def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConf
     )  # fmt: skip
 
 
-def write_fill(scene: Path, fused: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
+class FillViews(Output):
     """The scorer's baseline on some trajectories as folders of views, so that it is a method like the others."""
-    refuse_overlap(out, {"scene": scene, "fused": fused})
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused)}
-    folder = RunDir.open(out, _FILL_OUTPUT, {"trajectories": [path.name for path in paths]}, inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    fill = score.baseline_of(read_scene(scene), read_fused(fused))
-    with log.task(FILL, sum(map(len, paths))) as bar:
-        for path in paths:
-            with ObservationWriter(folder.path / path.name, path.name, FILL) as writer:
-                for index, view in enumerate(path.views):
-                    writer.skip(view) if index < writer.done else writer.add(fill(view))
-                    bar.advance()
-    folder.finish({"trajectories": [path.name for path in paths]})
-    return folder.path
+
+    version, files = 1, below("*", OBSERVATION_FILES)
+    scene: Path
+    fused: Path
+    paths: tuple[Trajectory, ...]
+
+    @classmethod
+    def verb(cls) -> str:
+        return FILL
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"trajectories": [path.name for path in self.paths]}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        fill = score.baseline_of(read_scene(self.scene), read_fused(self.fused))
+        with log.task(FILL, sum(map(len, self.paths))) as bar:
+            for path in self.paths:
+                with ObservationWriter(work.path / path.name, path.name, FILL) as writer:
+                    for index, view in enumerate(path.views):
+                        writer.skip(view) if index < writer.done else writer.add(fill(view))
+                        bar.advance()
+        return self.key_settings()
 
 
-def write_exact(truth: Path, paths: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
+class ExactViews(Output):
     """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
-    refuse_overlap(out, {"truth": truth})
-    shifted = [path.name for path in paths if path.origin == "shifted"]
-    folder = RunDir.open(out, _EXACT_OUTPUT, {"trajectories": shifted}, {"truth": store.digest(truth)}, overwrite)
-    if folder.complete:
-        return folder.reused()
-    for name in shifted:
-        views = read_observations(truth / name)
-        with ObservationWriter(folder.path / name, name, EXACT) as writer:
-            for index in range(len(views)):
-                seen = views[index]
-                writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
-    folder.finish({"trajectories": shifted})
-    return folder.path
+
+    version, files = 1, below("*", OBSERVATION_FILES)
+    truth: Path
+    paths: tuple[Trajectory, ...]
+
+    @classmethod
+    def verb(cls) -> str:
+        return EXACT
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"trajectories": [path.name for path in self.paths if path.origin == "shifted"]}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        for name in self.key_settings()["trajectories"]:
+            views = read_observations(self.truth / name)
+            with ObservationWriter(work.path / name, name, EXACT) as writer:
+                for index in range(len(views)):
+                    seen = views[index]
+                    writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
+        return self.key_settings()

@@ -21,7 +21,7 @@ from torch import Tensor
 from mudg.base import log, store
 from mudg.base.devices import choose_device
 from mudg.base.errors import InputError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Observation, Scene, View
 from mudg.benchmarks.places import Protocol
 from mudg.benchmarks.truth import Target, Targets, read_targets
@@ -35,13 +35,13 @@ from mudg.models.featnets import CodecFeatures, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
 from mudg.stages.score import evenly
 from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, apart_m
+from mudg.steps.outputs import Output
 
 PERCEPTUAL_VIEWS: Final = 12
 """Views of each place at which the perceptual distance is computed, evenly spread."""
 NONE: Final = "none"
 """In place of a number that there is not."""
 _MOST_DB: Final = 100.0
-_OUTPUT: Final = VerbOutput("bench real score", 2, ("metrics.json", "pictures/*.jpg"))
 
 Sum = NDArray[np.float64]
 Sums = Mapping[str, Sum]
@@ -256,39 +256,43 @@ def shipped_features(device: torch.device | None = None) -> CodecFeatures:
     return CodecFeatures(mdm_files.load("embedded").codec).to(device or torch.device("cpu"))
 
 
-def write_scores(
-    protocol: Protocol, source: Path, truth: Path, views: Path, out: Path, *, overwrite: bool = False, device: str = "cpu"
-) -> Path:
-    """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page.
+class ScoreTargets(Output):
+    """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page."""
 
-    Args:
-        device: of the network behind the perceptual distance.
-    """
-    refuse_overlap(out, {"log": source, "truth": truth, "views": views})
-    inputs = {"log": store.digest(source), "truth": store.digest(truth), "views": store.digest(views)}
-    settings = {"protocol": protocol.name, "columns": list(protocol.columns), "perceptual_views": PERCEPTUAL_VIEWS}
-    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    scene, targets, finder = read_scene(source), read_targets(truth), ViewFinder(views)
-    sampled = _perceptual_views(targets) if any(name.startswith("perceptual") for name in protocol.columns) else set()
-    features = None
-    if sampled:
-        network = choose_device(device, "networks of the scores")
-        features = PerceptualDistance(shipped_features(network), device=network)
-    sums: dict[str, dict[str, Sum]] = {}
-    with log.task(f"score {protocol.name}", len(targets)) as bar:
-        for number in range(len(targets)):
-            target = targets.load(number, scene)
-            sight = sight_of(target, finder.at(target.view), scene, protocol, features if number in sampled else None)
-            _add(sums.setdefault(target.place, {}), {name: COLUMNS[name].of(sight) for name in protocol.columns})
-            if number in targets.pictures:
-                picture = jpeg_bytes(_picture_of(sight, protocol), quality=80)
-                store.atomic_write(folder.path / "pictures" / f"{number:06d}.jpg", picture)
-            bar.advance()
-    store.write_json(folder.path / "metrics.json", values_of(protocol, sums))
-    folder.finish({"views": len(targets)})
-    return folder.path
+    version, files = 2, ("metrics.json", "pictures/*.jpg")
+    log: Path
+    truth: Path
+    views: Path
+    protocol: Protocol
+    device: str = "cpu"
+    """Of the network behind the perceptual distance."""
+
+    @classmethod
+    def verb(cls) -> str:
+        return "bench real score"
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"protocol": self.protocol.name, "columns": list(self.protocol.columns), "perceptual_views": PERCEPTUAL_VIEWS}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        scene, targets, finder, protocol = read_scene(self.log), read_targets(self.truth), ViewFinder(self.views), self.protocol
+        sampled = _perceptual_views(targets) if any(name.startswith("perceptual") for name in protocol.columns) else set()
+        features = None
+        if sampled:
+            network = choose_device(self.device, "networks of the scores")
+            features = PerceptualDistance(shipped_features(network), device=network)
+        sums: dict[str, dict[str, Sum]] = {}
+        with log.task(f"score {protocol.name}", len(targets)) as bar:
+            for number in range(len(targets)):
+                target = targets.load(number, scene)
+                sight = sight_of(target, finder.at(target.view), scene, protocol, features if number in sampled else None)
+                _add(sums.setdefault(target.place, {}), {name: COLUMNS[name].of(sight) for name in protocol.columns})
+                if number in targets.pictures:
+                    picture = jpeg_bytes(_picture_of(sight, protocol), quality=80)
+                    store.atomic_write(work.path / "pictures" / f"{number:06d}.jpg", picture)
+                bar.advance()
+        store.write_json(work.path / "metrics.json", values_of(protocol, sums))
+        return {"views": len(targets)}
 
 
 def _add(total: dict[str, Sum], part: Mapping[str, Sum | None]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,6 +16,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import is_temporary
 from mudg.core.raster.place import drawing_device
 from mudg.stages.config import BenchConfig
+from mudg.steps.engine import Result
 
 
 class BenchJob(Protocol):
@@ -62,14 +64,14 @@ def at_once(config: BenchConfig) -> int:
     return os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
 
 
-def step(verb: Callable[..., Path], *inputs: Any, overwrite: bool, **settings: Any) -> Path:
-    """Run a verb, or reuse its result; what other settings left in its folder is replaced only with ``overwrite``."""
+def run_step(step: Result) -> Path:
+    """Run a step, or reuse its result; what other settings left in its folder is replaced only with ``overwrite``."""
     try:
-        return verb(*inputs, **settings)
+        return replace(step, overwrite=False).run()
     except UsageError:
-        if not overwrite:
+        if not step.overwrite:
             raise
-        return verb(*inputs, **settings, overwrite=True)
+        return step.run()
 
 
 def finished(path: Path, measure: Callable[[], Any]) -> Any:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Trajectory
 from mudg.core.pictures import resize_area
 from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
@@ -24,6 +24,7 @@ from mudg.data.observations import ObservationSet, list_observation_sets, read_o
 from mudg.pages import html
 from mudg.pages.page import FPS, shift_title
 from mudg.pages.panels import panel_grid, panel_size
+from mudg.steps.outputs import Output
 
 PANEL_WIDTH: Final = 320
 ENCODING: Final = Encoding(FPS, first_crf=29, last_crf=41, preset="veryfast")
@@ -31,43 +32,44 @@ VIDEO_BYTES: Final = 900 * 1024
 """A video larger than this is made anew in lower quality: eight logs of seven trajectories stay under 60 MB."""
 ROWS: Final = {"rgb": "colour", "error": "colour error", "depth": "depth"}
 """Rows of a video, and their titles."""
-_OUTPUT: Final = VerbOutput("film", 1, ("*.mp4", "*.jpg"))
 
 
-def film(
-    views: Mapping[str, Path | Sequence[Path]], paths: Sequence[Trajectory], out: Path, *, videos: bool = True, overwrite: bool = False
-) -> Path:  # fmt: skip
-    """Write one video and one picture per trajectory: columns truth and methods, rows as ``ROWS``.
+class Film(Output):
+    """Write one video and one picture per trajectory: columns truth and methods, rows as ``ROWS``."""
 
-    Args:
-        views: column -> folder of observation folders, or several. Where "truth" is among them, it has every trajectory; else there is
-            no row of errors.
-        videos: off: only the pictures, of the middle view and in full size.
-    """
-    folders = {name: (folder,) if isinstance(folder, Path) else tuple(folder) for name, folder in views.items()}
-    named = {f"{name} {n}" if n else name: folder for name, of in folders.items() for n, folder in enumerate(of)}
-    refuse_overlap(out, named)
-    inputs = {name: store.digest(folder) for name, folder in named.items()}
-    settings: dict[str, Any] = {"columns": list(views), "trajectories": [path.name for path in paths], "panel_width_px": PANEL_WIDTH}
-    folder = RunDir.open(out, _OUTPUT, settings if videos else {**settings, "videos": False}, inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    listed = {name: {k: v for one in of for k, v in list_observation_sets(one).items()} for name, of in folders.items()}
-    playable = videos and bool(video_encoders())
-    for path in paths:
-        sets = {name: read_observations(sets[path.name]) for name, sets in listed.items() if path.name in sets}
-        if "truth" in views and "truth" not in sets:
-            raise InputError("no ground truth to show", where=f"{views['truth']}: {path.name}")
-        if not sets:
-            continue
-        pictures = list(_frames(sets, list(views), range(len(path)) if playable else [len(path) // 2]))
-        if playable:
-            store.atomic_write(folder.path / f"{path.name}.mp4", mp4_within(lambda frames=pictures: frames, ENCODING, VIDEO_BYTES))
-        middle = pictures[len(pictures) // 2]
-        poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2) if videos else middle
-        store.atomic_write(folder.path / f"{path.name}.jpg", jpeg_bytes(poster, quality=75))
-    folder.finish({"columns": list(views), "videos": playable})
-    return folder.path
+    version, files = 1, ("*.mp4", "*.jpg")
+    views: Mapping[str, tuple[Path, ...]]
+    """Column -> folders of observation folders. Where "truth" is among them, it has every trajectory; else there is no row of errors."""
+    paths: tuple[Trajectory, ...]
+    videos: bool = True
+    """Off: only the pictures, of the middle view and in full size."""
+
+    def reads(self) -> dict[str, Path | str | None]:
+        return {f"{name} {n}" if n else name: folder for name, of in self.views.items() for n, folder in enumerate(of)}
+
+    def inputs(self) -> dict[str, str]:
+        return self.digests(self.reads())
+
+    def key_settings(self) -> dict[str, Any]:
+        settings = {"columns": list(self.views), "trajectories": [path.name for path in self.paths], "panel_width_px": PANEL_WIDTH}
+        return settings if self.videos else {**settings, "videos": False}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        listed = {name: {k: v for one in of for k, v in list_observation_sets(one).items()} for name, of in self.views.items()}
+        playable = self.videos and bool(video_encoders())
+        for path in self.paths:
+            sets = {name: read_observations(sets[path.name]) for name, sets in listed.items() if path.name in sets}
+            if "truth" in self.views and "truth" not in sets:
+                raise InputError("no ground truth to show", where=f"{self.views['truth'][0]}: {path.name}")
+            if not sets:
+                continue
+            pictures = list(_frames(sets, list(self.views), range(len(path)) if playable else [len(path) // 2]))
+            if playable:
+                store.atomic_write(work.path / f"{path.name}.mp4", mp4_within(lambda frames=pictures: frames, ENCODING, VIDEO_BYTES))
+            middle = pictures[len(pictures) // 2]
+            poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2) if self.videos else middle
+            store.atomic_write(work.path / f"{path.name}.jpg", jpeg_bytes(poster, quality=75))
+        return {"columns": list(self.views), "videos": playable}
 
 
 def _frames(sets: Mapping[str, ObservationSet], order: Sequence[str], frames: Sequence[int]) -> Iterator[NDArray[np.uint8]]:

@@ -14,26 +14,28 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mudg.base import store
 from mudg.base.devices import DeviceName
 from mudg.base.errors import InputError, UsageError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.layout import SCENE_FILES
+from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Frame, Scene
-from mudg.benchmarks.loop import step
+from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.papers import SCENE_LISTS, PaperTable
 from mudg.data.city import logs as city_logs
 from mudg.data.city.logs import STANDARD, LogRules
 from mudg.data.importers.options import holdout_split, parse_frame_range, parse_resolution
-from mudg.data.scene import SCENE_FILES, read_scene
+from mudg.data.scene import read_scene
 from mudg.data.scene.part import write_part
 from mudg.stages import annotate, ingest
 from mudg.stages.config import AnnotateConfig, BenchConfig, IngestConfig, on_device
+from mudg.steps.annotate import Annotate
+from mudg.steps.ingest import Ingest
+from mudg.steps.outputs import Output
 
 CITY: Final = "city:"
 """How the name of a list of generated cities begins."""
 SHOWN_BETWEEN: Final = 3
 """Fewest shown moments before, between and after blocks of held-out ones, where a log is long enough for it."""
-_SHOWN: Final = VerbOutput("frames of a table", 1, SCENE_FILES)
 _NAME: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
 
 
@@ -173,14 +175,14 @@ def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overw
     """
     if isinstance(log, ListedCity):
         settings = IngestConfig(test_every=table.held_out_every, city=city_logs.log_config(log.seed, log.rules))
-        return step(ingest.run, settings, ingest.CITY, out / "scene", overwrite=overwrite)
+        return run_step(Ingest(log=ingest.CITY, out=out / "scene", overwrite=overwrite, settings=settings))
     refuse_overlap(out, {"log": log.source})
     whole, frames = log.source, log.frames
     if not ingest.is_scene(whole):
         text = "" if frames is None else f"{frames[0]}:{frames[1] + 1}"
         settings = IngestConfig(test_every=0, resolution=log.size, frames=text)
-        whole, frames = step(ingest.run, settings, log.source, out / "imported", overwrite=overwrite), None
-    shown = step(_write_shown, whole, frames, table, out / "shown", overwrite=overwrite)
+        whole, frames = run_step(Ingest(log=str(log.source), out=out / "imported", overwrite=overwrite, settings=settings)), None
+    shown = run_step(ShownFrames(scene=whole, frames=frames, table=table, out=out / "shown", overwrite=overwrite))
     return labelled(shown, out / "scene", device, overwrite)
 
 
@@ -189,48 +191,56 @@ def labelled(scene: Path, out: Path, device: DeviceName, overwrite: bool) -> Pat
     settings = on_device(AnnotateConfig(processes=1), device)
     if all(annotate.wanted_labels(settings) <= set(frame.labels) for frame in read_scene(scene).frames):
         return scene
-    return step(annotate.run, settings, scene, out, overwrite=overwrite)
+    return run_step(Annotate(scene=scene, out=out, overwrite=overwrite, settings=settings))
 
 
 def imported(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> Path:
     """A log as a scene: as it is, or imported with the settings of this configuration."""
     if not ingest.is_scene(source):
         settings = IngestConfig(resolution=config.resolution, frames=config.frames, test_every=0)
-        return step(ingest.run, settings, source, out, overwrite=overwrite)
+        return run_step(Ingest(log=str(source), out=out, overwrite=overwrite, settings=settings))
     if config.resolution or config.frames:
         raise UsageError("a scene is taken as it is", where=str(source), got="--resolution or --frames",
                          remedy="leave them out, or give the dataset's own folder")  # fmt: skip
     return source
 
 
-def _write_shown(
-    whole: Path, frames: tuple[int, int] | None, table: PaperTable, out: Path, *, overwrite: bool = False
-) -> Path:
+class ShownFrames(Output):
     """The table's frames of a scene, with its rule of what is held out."""
-    rules = {"frames": frames, "held_out_every": table.held_out_every, "front_only": table.front_only}
-    folder = RunDir.open(out, _SHOWN, rules, {"scene": store.digest(whole)}, overwrite)
-    if folder.complete:
-        return folder.reused()
-    scene = read_scene(whole)
-    camera = first_camera(scene, ())
-    times = np.array(sorted(frame.view.time_s for frame in scene.frames_of(camera)))
-    first, last = frames or (0, len(times) - 1)
-    if frames is not None and len(times) == last - first + 1:
-        first, last = 0, len(times) - 1  # imported with these very frames
-    if last >= len(times):
-        raise InputError("the log has fewer frames than the table asks for", where=str(whole), expected=f"frames {first} to {last}",
-                         got=f"{len(times)} frames of camera {camera}", remedy="give the whole log, or choose --frames")  # fmt: skip
-    moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
-    chosen = [
-        frame for frame in scene.frames
-        if first <= moment(frame.view.time_s) <= last and (not table.front_only or frame.view.camera.name == camera)
-    ]  # fmt: skip
-    sweeps = [sweep.id for sweep in scene.sweeps if first <= moment(sweep.time_s) <= last]
-    groups = [[f.id for f in chosen if moment(f.view.time_s) == number] for number in range(first, last + 1)]
-    held = [name for name, part in holdout_split(groups, table.held_out_every).items() if part == "test"]
-    write_part(scene, folder.path, {frame.id for frame in chosen}, sweeps, held_out=held)
-    folder.finish({"frames": len(chosen), "held_out": len(held)})
-    return folder.path
+
+    version, files = 1, SCENE_FILES
+    scene: Path
+    frames: tuple[int, int] | None
+    table: PaperTable
+
+    @classmethod
+    def verb(cls) -> str:
+        return "frames of a table"
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"frames": self.frames, "held_out_every": self.table.held_out_every, "front_only": self.table.front_only}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        scene = read_scene(self.scene)
+        camera = first_camera(scene, ())
+        times = np.array(sorted(frame.view.time_s for frame in scene.frames_of(camera)))
+        first, last = self.frames or (0, len(times) - 1)
+        if self.frames is not None and len(times) == last - first + 1:
+            first, last = 0, len(times) - 1  # imported with these very frames
+        if last >= len(times):
+            raise InputError("the log has fewer frames than the table asks for", where=str(self.scene),
+                             expected=f"frames {first} to {last}",
+                             got=f"{len(times)} frames of camera {camera}", remedy="give the whole log, or choose --frames")  # fmt: skip
+        moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
+        chosen = [
+            frame for frame in scene.frames
+            if first <= moment(frame.view.time_s) <= last and (not self.table.front_only or frame.view.camera.name == camera)
+        ]  # fmt: skip
+        sweeps = [sweep.id for sweep in scene.sweeps if first <= moment(sweep.time_s) <= last]
+        groups = [[f.id for f in chosen if moment(f.view.time_s) == number] for number in range(first, last + 1)]
+        held = [name for name, part in holdout_split(groups, self.table.held_out_every).items() if part == "test"]
+        write_part(scene, work.path, {frame.id for frame in chosen}, sweeps, held_out=held)
+        return {"frames": len(chosen), "held_out": len(held)}
 
 
 # ---- what is hidden of a real log, and scored ----

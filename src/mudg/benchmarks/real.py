@@ -22,12 +22,13 @@ from typing import Any, Final
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.layout import SCENE_FILES
+from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Scene
 from mudg.benchmarks import page as pages
 from mudg.benchmarks.chain import Chain
-from mudg.benchmarks.columns import COLUMNS, mean_values, write_scores
-from mudg.benchmarks.loop import compare, refuse_foreign, step
+from mudg.benchmarks.columns import COLUMNS, ScoreTargets, mean_values
+from mudg.benchmarks.loop import compare, refuse_foreign, run_step
 from mudg.benchmarks.places import (
     SPLITS,
     HeldOut,
@@ -42,18 +43,43 @@ from mudg.benchmarks.places import (
 )
 from mudg.benchmarks.rows import BASE, FILL, Row, Sees, chain_settings, generator_of, real_rows, refuse_unfit
 from mudg.benchmarks.shift import virtual_fits_of
-from mudg.benchmarks.truth import read_targets, write_targets
-from mudg.data.scene import SCENE_FILES, read_scene
+from mudg.benchmarks.truth import MakeTargets, read_targets
+from mudg.data.scene import read_scene
 from mudg.data.scene.part import write_part
 from mudg.models.mdm import files as mdm_files
 from mudg.pages.tables import TextTable, markdown_table
 from mudg.pages.tables import markdown as rendered
-from mudg.stages import adapt, render
+from mudg.stages import render
 from mudg.stages.adapting.clips import why_not
 from mudg.stages.config import AdaptConfig, BenchConfig, PresetName, RenderConfig, on_device
+from mudg.steps.adapt import Adapt
+from mudg.steps.outputs import Output
 
 PAGES: Final = ("bench.json", "bench.md", "page.html")
-_PART: Final = VerbOutput("part of a scene", 1, SCENE_FILES)
+
+
+class PartOfScene(Output):
+    """A part of a scene that a split shows."""
+
+    version, files = 1, SCENE_FILES
+    split: str
+    shown: tuple[str, ...]
+    digests_read: Mapping[str, str]
+    write: Callable[[Path], Scene]
+
+    @classmethod
+    def verb(cls) -> str:
+        return "part of a scene"
+
+    def inputs(self) -> dict[str, str]:
+        return dict(self.digests_read)
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"split": self.split, "shown": list(self.shown)}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        scene = self.write(work.path)
+        return {"frames": len(scene.frames), "sweeps": len(scene.sweeps)}
 
 
 def run(
@@ -154,9 +180,10 @@ class SplitJob:
         chain, cameras = self.chain(), self.cameras(whole, held)
         truths, result = {}, {}
         for protocol in self.protocols:
-            truth = chain.step(
-                write_targets, protocol, self.source, chain.scene, held.frames, cameras, self.out / "truth" / protocol.name
-            )
+            truth = chain.run(MakeTargets(
+                log=self.source, shown=chain.scene, protocol=protocol, held=tuple(held.frames), cameras=cameras,
+                out=self.out / "truth" / protocol.name,
+            ))  # fmt: skip
             targets = read_targets(truth)
             result[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
             if len(targets):
@@ -171,10 +198,10 @@ class SplitJob:
             if use is not None:
                 used[row.name] = {"sees": use.sees, "note": use.note}
             for protocol in (p for p in self.protocols if p.name in truths):
-                scored = chain.step(
-                    write_scores, protocol, self.source, truths[protocol.name], views, self.out / "score" / protocol.name / row.name,
-                    device=self.config.device,
-                )  # fmt: skip
+                scored = chain.run(ScoreTargets(
+                    log=self.source, truth=truths[protocol.name], views=views, protocol=protocol, device=self.config.device,
+                    out=self.out / "score" / protocol.name / row.name,
+                ))  # fmt: skip
                 result[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
         return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": result}
 
@@ -193,16 +220,10 @@ class SplitJob:
 
     def _write(self, out: Path, inputs: dict[str, str], write: Callable[[Path], Scene]) -> Path:
         """Write a part of a scene as a folder that is verified and reused."""
-
-        def part(*, overwrite: bool = False) -> Path:
-            folder = RunDir.open(out, _PART, {"split": self.split.name, "shown": list(self.config.shown)}, inputs, overwrite)
-            if folder.complete:
-                return folder.reused()
-            scene = write(folder.path)
-            folder.finish({"frames": len(scene.frames), "sweeps": len(scene.sweeps)})
-            return folder.path
-
-        return step(part, overwrite=self.overwrite)
+        shown = tuple(self.config.shown)
+        return run_step(
+            PartOfScene(split=self.split.name, shown=shown, digests_read=inputs, write=write, out=out, overwrite=self.overwrite)
+        )
 
     def cameras(self, whole: Scene, held: HeldOut) -> tuple[str, ...]:
         """The cameras whose views are asked for."""
@@ -252,7 +273,7 @@ class SplitJob:
         if not reason:
             first = chain.first()
             try:
-                chain.step(adapt.run, settings, chain.scene, chain.fused, first, folder)
+                chain.run(Adapt(scene=chain.scene, fused=chain.fused, fitted=first, out=folder, settings=settings))
             except InputError as error:
                 reason = f"{error.what}, {error.got}" if error.got else error.what
         if reason:

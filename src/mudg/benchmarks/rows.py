@@ -19,7 +19,7 @@ from mudg.stages import score
 from mudg.stages.config import BenchConfig, FitConfig, PresetName, SynthesizeConfig, bench_preset
 from mudg.stages.fitting.recipes import recipe_of
 from mudg.stages.learning import loading
-from mudg.stages.run import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
+from mudg.steps.pipeline import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, WITHOUT_DIFFUSION, "mudg_r", "mudg_s"
 LONGER: Final = f"{BASE}-longer"

@@ -30,7 +30,7 @@ from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
 from mudg.models.mdm import files as mdm_files
 from mudg.models.published.files import is_published
 from mudg.stages.config import BenchConfig, FitConfig, PresetName, bench_preset
-from mudg.stages.run import refuse_missing
+from mudg.steps.pipeline import refuse_missing
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 EDIT, SHIFT, REAL, PAPER = "edit", "shift", "real", "paper"

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from mudg.base import log, palette, store
 from mudg.base.camera_colors import ColorMap
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene, View
 from mudg.benchmarks.places import Protocol
 from mudg.core import color_match, points_seen, trajectory
@@ -34,6 +34,7 @@ from mudg.data.scene import read_image, read_scene
 from mudg.models.labels.inputs import box_outline
 from mudg.stages.scoring import log_points
 from mudg.stages.scoring.log_points import LogPoints
+from mudg.steps.outputs import Output
 
 LEAST_SEEN: Final = 0.05
 """Cameras of whose pixels the shown cameras saw less than this share are left out."""
@@ -41,7 +42,6 @@ LEAST_POINTS: Final = 10
 """A dynamic object counts in a view that shows at least this many of its LiDAR points."""
 PICTURES: Final = 4
 SPLAT_SHARE: Final = 0.006
-_OUTPUT: Final = VerbOutput("bench real truth", 2, ("targets.json", "maps/*.safetensors", "pictures/*.jpg"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,39 +82,43 @@ class Targets:
         return Target(record["place"], frame, view, maps, self.color_maps.get(record["place"], ColorMap()))
 
 
-def write_targets(
-    protocol: Protocol, source: Path, seen: Path, held: Sequence[str], cameras: Sequence[str], out: Path, *, overwrite: bool = False
-) -> Path:
-    """Write the truth of a log under a protocol.
+class MakeTargets(Output):
+    """Write the truth of a log under a protocol."""
 
-    Args:
-        source: the whole log. seen: what the methods saw of it, with labels (for what the shown cameras saw).
-        held: held-out frames, which are scored; empty = every frame of ``cameras``.
-    """
-    refuse_overlap(out, {"log": source, "shown": seen})
-    settings = {"protocol": asdict(protocol), "held_out": list(held), "cameras": list(cameras)}
-    inputs = {"log": store.digest(source), "shown": store.digest(seen)}
-    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    scene = read_scene(source)
-    maker = _Maker(protocol, scene, seen)
-    hidden = set(held)
-    frames = [f for f in scene.frames if (f.id in hidden if hidden else f.view.camera.name in cameras)]
-    by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
-    records, left_out, color_maps = _written(maker, by_camera, folder.path)
-    pictures = _write_pictures(maker, records, folder.path)
-    document = {
-        "views": records, "color_maps": {name: asdict(found) for name, found in color_maps.items()}, "pictures": pictures,
-        "left_out": left_out, "reason": "" if records else (next(iter(left_out.values()), "no frame to score")),
-    }  # fmt: skip
-    store.write_json(folder.path / "targets.json", document)
-    folder.finish({"views": len(records)})
-    return folder.path
+    version, files = 2, ("targets.json", "maps/*.safetensors", "pictures/*.jpg")
+    log: Path
+    """The whole log."""
+    shown: Path
+    """What the methods saw of it, with labels (for what the shown cameras saw)."""
+    protocol: Protocol
+    held: tuple[str, ...]
+    """Held-out frames, which are scored; empty = every frame of `cameras`."""
+    cameras: tuple[str, ...]
+
+    @classmethod
+    def verb(cls) -> str:
+        return "bench real truth"
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"protocol": asdict(self.protocol), "held_out": list(self.held), "cameras": list(self.cameras)}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        scene, hidden = read_scene(self.log), set(self.held)
+        maker = _Maker(self.protocol, scene, self.shown)
+        frames = [f for f in scene.frames if (f.id in hidden if hidden else f.view.camera.name in self.cameras)]
+        by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
+        records, left_out, color_maps = _written(maker, by_camera, work.path)
+        pictures = _write_pictures(maker, records, work.path)
+        document = {
+            "views": records, "color_maps": {name: asdict(found) for name, found in color_maps.items()}, "pictures": pictures,
+            "left_out": left_out, "reason": "" if records else (next(iter(left_out.values()), "no frame to score")),
+        }  # fmt: skip
+        store.write_json(work.path / "targets.json", document)
+        return {"views": len(records)}
 
 
 def read_targets(folder: Path) -> Targets:
-    """What ``write_targets`` wrote."""
+    """What ``MakeTargets`` wrote."""
     found = store.read_json(folder / "targets.json")
     maps = {name: ColorMap(tuple(m["gain"]), tuple(m["offset"]), m["pairs"]) for name, m in found["color_maps"].items()}
     places = dict.fromkeys(record["place"] for record in found["views"])

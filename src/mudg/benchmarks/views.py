@@ -14,15 +14,16 @@ from typing import Any, Final
 from mudg.base import store
 from mudg.base.types import Scene, Trajectory
 from mudg.benchmarks import page
-from mudg.benchmarks.chain import Chain, write_exact
-from mudg.benchmarks.loop import step
+from mudg.benchmarks.chain import Chain, ExactViews
+from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.papers import RECORDED, PaperTable
 from mudg.benchmarks.places import ListedCity, Log, first_camera, make_scene
 from mudg.benchmarks.rows import EXACT, FILL, Row, generator_of
 from mudg.data.scene import read_scene
 from mudg.methods import METHODS
-from mudg.stages import render, score, score_truth
+from mudg.stages import render
 from mudg.stages.config import BenchConfig, RenderConfig, ScoreConfig, SynthesizeConfig, on_device
+from mudg.steps.score import DrawTruth, Score
 
 TRUTH: Final = "truth"
 ALL_VIEWS: Final = 1_000_000
@@ -91,7 +92,7 @@ class Views:
         """Exact truth of a generated log."""
         if not isinstance(self.log, ListedCity):
             return None
-        return self.chain.step(score_truth.write_truth, self.scene, self.paths, self.out / TRUTH)
+        return self.chain.run(DrawTruth(scene=self.scene, trajectories=self.paths, out=self.out / TRUTH))
 
     def trajectories(self, endings: Sequence[str]) -> tuple[str, ...]:
         """Names of the trajectories of a place."""
@@ -117,7 +118,7 @@ class Views:
             return tuple(folders)
         virtual: tuple[Path, ...] = ()
         if row.name == EXACT:
-            virtual = (self.chain.step(write_exact, self.truth, self.paths, self.out / EXACT),)
+            virtual = (self.chain.run(ExactViews(truth=self.truth, paths=self.paths, out=self.out / EXACT)),)
         elif row.learns_virtual:
             virtual = (self.chain.generated(self.off_path, self.out / self.virtual, renders=self.renders),)
         return (self.chain.rendered(row, virtual, self.drawn),)
@@ -128,14 +129,15 @@ class Views:
         settings, documents = replace(self.score, perceptual_views=0, lpips_weights="") if name == TRUTH else self.score, {}
         for number, folder in enumerate(folders):
             scored = self.out / "score" / (f"{name}-{number}" if number else name)
-            self.chain.step(score.run, settings, self.scene, {name: folder}, scored, truth=self.truth)
+            self.chain.run(Score(scene=self.scene, views={name: folder}, truth=self.truth, out=scored, settings=settings))
             documents[scored] = store.read_json(scored / "metrics.json")
         return documents
 
     def film(self, shown: Mapping[str, Path | Sequence[Path]]) -> list[str]:
         """Make a picture (or video) of every trajectory; returns their names. With another method the old ones are out of date, whatever
         was asked."""
-        step(page.film, shown, self.paths, self.out / "film", videos=self.config.videos, overwrite=True)
+        views = {name: (folder,) if isinstance(folder, Path) else tuple(folder) for name, folder in shown.items() if folder is not None}
+        run_step(page.Film(views=views, paths=self.paths, videos=self.config.videos, out=self.out / "film", overwrite=True))
         return [path.name for path in self.paths]
 
 

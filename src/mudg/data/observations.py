@@ -26,8 +26,6 @@ from mudg.data.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
 _SCHEMA = 1
-OBSERVATION_FILES = (_INDEX, "rgb/*.png", "data/*.safetensors")
-"""Patterns of the names in a folder of observations."""
 
 
 class ObservationWriter:

@@ -1,7 +1,8 @@
 """adapt: the diffusion model, trained for a few steps on the log that it is going to work on.
 
-Read from `run`: short fits to what the lessons of the log show (`adapting/lessons.py`), clips of them (`adapting/clips.py`), some steps of
-the `learn` verb, and the comparison on blocks of frames that were kept for it. Frames that the scene holds out are never read.
+Read from `PlannedAdaptation`: short fits to what the lessons of the log show (`adapting/lessons.py`), clips of them
+(`adapting/clips.py`), some steps of the `learn` verb, and the comparison on blocks of frames that were kept for it. Frames that the scene
+holds out are never read.
 
     OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as `learn`'s)
     OUT/adapt.json        scores of both on the clips kept for scoring, and which was taken
@@ -11,9 +12,8 @@ the `learn` verb, and the comparison on blocks of frames that were kept for it. 
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,15 @@ import torch
 
 from mudg import native
 from mudg.base import log, store
-from mudg.base.config import result_settings
-from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import run_in_processes
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.clips.from_city import HELD_OUT
 from mudg.data.scene import read_scene
 from mudg.models.diffusion import SampleRequest
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages import learn
 from mudg.stages.adapting.clips import CLIPS, Plan, make_lesson, plan_clips, why_too_short
-from mudg.stages.adapting.lessons import LearntLog, Lesson, cameras_of, lessons_of
+from mudg.stages.adapting.lessons import FitScene, LearntLog, Lesson, cameras_of, lessons_of
 from mudg.stages.config import AdaptConfig, LearnConfig
 from mudg.stages.config.learn import LearnCompute, LearnData, LearnOptimizer, LearnScore
 from mudg.stages.fitting.storage import model_of_scene
@@ -41,7 +37,6 @@ from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.models import model_of_window
 from mudg.stages.learning.precision import choose_bf16
 
-_OUTPUT = VerbOutput("adapt", 2, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/"))
 MOST_SCALE = 4
 """Patches are at most this many times finer than the clips."""
 SCORED_STEPS = 2
@@ -52,47 +47,65 @@ LEAST_GAIN_DB = 0.05
 """An adapted model that gains less than this on the clips kept for scoring is not taken."""
 
 
-def run(config: AdaptConfig, scene: Path, fused: Path, fitted: Path, out: Path, *, overwrite: bool = False) -> Path:
-    """Adapt a diffusion model to a log; returns the folder of the model to use (`OUT/model`).
+@dataclass(frozen=True, eq=False)
+class PlannedAdaptation:
+    """The lessons of a log, and the clips that they are made into.
 
     Args:
-        config: see `AdaptConfig`.
-        scene: scene directory or stored zip. fused: output of fuse for it. fitted: output of fit for it, without virtual views.
-
-    Raises:
-        InputError: the log is too short, inputs malformed. UsageError: a model that does not use renders.
+        model: that is adapted.
     """
-    refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "model": mdm_files.folder_of(config.model)})
-    config = replace(config, device=str(choose_device(config.device, "diffusion model", NETWORK_KINDS)))
-    model = mdm_files.load(config.model)
-    if not mdm_files.uses_renders(config.model):
-        raise UsageError("this model was not trained with renders of a fitted scene", where="--model", got=config.model,
-                         remedy="choose another model; `embedded` is one that was")  # fmt: skip
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "fitted": store.digest(fitted),
-              "model": mdm_files.digest(config.model)}  # fmt: skip
-    learnt, lessons = _open_log(config, model, Path(scene), Path(fused), Path(fitted))
-    plan = plan_clips(lessons, config)
-    reason = why_too_short(plan, config)
-    if reason:
-        raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
-                         remedy="smaller --block, or use the model as it is")  # fmt: skip
-    settings = {name: value for name, value in result_settings(config).items() if name != "processes"}
-    directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
-    if directory.complete:
-        return directory.reused() / "model"
-    work = directory.path / "work"
-    made = _make_lessons(config, learnt, lessons, plan, work)
-    base = model_of_window(model, config.block)
-    log.info(f"adapt: {len(plan)} clips, {made} of them made now")
-    adapted = learn.run(_training(config, learnt, plan, work / CLIPS), work / "learn")
-    record = _choose(config, base, plan, work, directory.path)
-    chosen = mdm_files.load(adapted) if record["adapted"] else model
-    facts = {**mdm_files.facts(config.model), "adapted": record}
-    mdm_files.save(model_of_window(chosen, model.config.window), directory.path / "model", _card(config, record), facts)
-    store.write_json(directory.path / "adapt.json", record)
-    shutil.rmtree(work, ignore_errors=True)
-    directory.finish({"adapted": record["adapted"], "psnr": [record["before"]["psnr"], record["after"]["psnr"]]})
-    return directory.path / "model"
+
+    config: AdaptConfig
+    model: MDM
+    learnt: LearntLog
+    lessons: list[Lesson]
+    clips: Plan
+
+    @classmethod
+    def of(cls, config: AdaptConfig, scene: Path, fused: Path, fitted: Path) -> PlannedAdaptation:
+        """Plan the adaptation to a log.
+
+        Raises:
+            InputError: the log is too short, inputs malformed. UsageError: a model that does not use renders.
+        """
+        model = mdm_files.load(config.model)
+        if not mdm_files.uses_renders(config.model):
+            raise UsageError("this model was not trained with renders of a fitted scene", where="--model", got=config.model,
+                             remedy="choose another model; `embedded` is one that was")  # fmt: skip
+        learnt, lessons = _open_log(config, model, scene, fused, fitted)
+        clips = plan_clips(lessons, config)
+        reason = why_too_short(clips, config)
+        if reason:
+            raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
+                             remedy="smaller --block, or use the model as it is")  # fmt: skip
+        return cls(config, model, learnt, lessons, clips)
+
+    def make_clips(self, fit_scene: FitScene, work: Path) -> None:
+        """Fits and clips of all lessons, several made at a time. fit_scene: fuses and fits one, also in another process."""
+        jobs = [
+            (self.config, self.learnt, lesson, [row for row in self.clips if row[1].name == lesson.name], work, fit_scene)
+            for lesson in self.lessons
+        ]
+        made, cores = 0, native.default_threads()
+        processes = self.config.processes or (cores if self.config.device == "cpu" else min(cores, SHARING))
+        with log.task("lessons", len(jobs)) as bar:
+            for _, clips in run_in_processes(make_lesson, jobs, min(processes, len(jobs))):
+                made += clips
+                bar.advance()
+        log.info(f"adapt: {len(self.clips)} clips, {made} of them made now")
+
+    def training(self, work: Path) -> LearnConfig:
+        """The settings of the training, in terms of `learn`."""
+        return _training(self.config, self.learnt, self.clips, work / CLIPS)
+
+    def write_model(self, adapted: Path, work: Path, out: Path) -> dict[str, Any]:
+        """Write the better one of the model as it was and as it was adapted; returns a summary."""
+        record = _choose(self.config, model_of_window(self.model, self.config.block), self.clips, work, out)
+        chosen = mdm_files.load(adapted) if record["adapted"] else self.model
+        facts = {**mdm_files.facts(self.config.model), "adapted": record}
+        mdm_files.save(model_of_window(chosen, self.model.config.window), out / "model", _card(self.config, record), facts)
+        store.write_json(out / "adapt.json", record)
+        return {"adapted": record["adapted"], "psnr": [record["before"]["psnr"], record["after"]["psnr"]]}
 
 
 def _open_log(config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted: Path) -> tuple[LearntLog, list[Lesson]]:
@@ -107,19 +120,6 @@ def _open_log(config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted:
     width, height = model.image_size(camera.width, camera.height)
     scale = max(1, min(MOST_SCALE, camera.width // width))
     return LearntLog(scene, fused, fitted, width, height, scale), lessons_of(loaded, config)
-
-
-def _make_lessons(config: AdaptConfig, learnt: LearntLog, lessons: list[Lesson], plan: Plan, work: Path) -> int:
-    """Fits and clips of all lessons, several made at a time; returns the number of clips made."""
-    jobs = [(config, learnt, lesson, [row for row in plan if row[1].name == lesson.name], work) for lesson in lessons]
-    made = 0
-    cores = native.default_threads()
-    processes = config.processes or (cores if config.device == "cpu" else min(cores, SHARING))
-    with log.task("lessons", len(jobs)) as bar:
-        for _, clips in run_in_processes(make_lesson, jobs, min(processes, len(jobs))):
-            made += clips
-            bar.advance()
-    return made
 
 
 def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -> LearnConfig:

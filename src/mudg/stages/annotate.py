@@ -21,83 +21,47 @@ from numpy.typing import NDArray
 
 from mudg import native
 from mudg.base import log, store
-from mudg.base.config import result_settings
 from mudg.base.processes import one_torch_thread, run_in_processes
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene
-from mudg.data.scene import SCENE_FILES, SceneWriter, read_image, read_scene
+from mudg.data.scene import SceneWriter, read_image, read_scene
 from mudg.models.folders import CPU
 from mudg.models.labels.ground import driven_path
 from mudg.models.labels.inputs import LabelInput, Labels
 from mudg.models.labels.labellers import labeller
 from mudg.pages.annotate_page import write_page
-from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.plan import read_list
 from mudg.stages.config import AnnotateConfig
 from mudg.stages.labelling import depth as annotate_depth
 from mudg.stages.labelling.ego import find_ego
 from mudg.stages.labelling.points import NearbyReturns
 
 _STAGING = "labelled"
-_OUTPUT = VerbOutput("annotate", 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", f"{_STAGING}/"))
 _SHARING = 4
 """Processes that share a device with the shipped network: each holds a context of some hundred megabytes there."""
 _FRAMES_PER_PROCESS = 8
 """Fewer frames than this are not worth the start of a process."""
 
 
-def run(config: AnnotateConfig, scene: Path, out: Path, *, overwrite: bool = False) -> Path:
-    """Label a scene; ``out`` becomes a scene with labels, and ``labels.html`` shows some of them.
-
-    Args:
-        config: see ``AnnotateConfig``.
-        scene: scene directory or stored zip.
-        out: output folder; a finished result of the same configuration and scene is verified and reused.
-
-    Raises:
-        InputError: the scene is malformed. UsageError: ``out`` holds something else. ResourceError: weights or the device are missing.
-    """
-    refuse_overlap(out, {"scene": scene, **annotate_depth.folders(config)})
-    config = annotate_depth.placed(config)
-    settings = result_settings(config)
-    settings.pop("processes")  # changes no result
-    inputs = inputs_of(config, scene)
-    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    loaded = read_scene(scene)
+def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[str, Any]:
+    """Label a scene; the work folder becomes a scene with labels, and ``labels.html`` shows some of them. Returns a summary."""
+    loaded, out = read_scene(scene), work.path
     wanted = wanted_labels(config)
     missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]
     if not missing:
         log.info("annotate: the scene already has all labels; nothing to add")
-    if not (folder.path / "scene.json").is_file():
-        staging = folder.path / _STAGING
-        _label_frames(config, Path(scene), loaded, missing, staging)
+    if not (out / "scene.json").is_file():
+        staging = out / _STAGING
+        _label_frames(config, scene, loaded, missing, staging)
         source = dataclasses.replace(
-            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, inputs, staging))
+            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, work.inputs, staging))
         )
-        with SceneWriter(folder.path, loaded.id, source) as writer:
+        with SceneWriter(out, loaded.id, source) as writer:
             writer.copy_all_but_frames(loaded)
             _add_frames(config, loaded, missing, staging, writer)
             writer.finish()
-    made = read_scene(folder.path)
-    write_page(made, {frame.id for frame in missing}, folder.path)
-    shutil.rmtree(folder.path / _STAGING, ignore_errors=True)
-    folder.finish({"labelled": len(missing), "labeller": config.labeller if missing else "labels present"})
-    return folder.path
-
-
-def run_many(
-    config: AnnotateConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
-) -> dict[str, Any]:
-    """``run`` for every scene of a list; see ``stages/batches/listed.py``."""
-    entries = read_list(listed)
-    return run_listed(ListedRun("annotate", dataclasses.replace(config, processes=1), entries, out, jobs, overwrite, shard, listed))
-
-
-def inputs_of(config: AnnotateConfig, scene: Path) -> dict[str, str]:
-    """Digests of what the labels are made from: the scene and the networks that are used."""
-    return {"scene": store.digest(scene), **annotate_depth.digests(config)}
+    write_page(read_scene(out), {frame.id for frame in missing}, out)
+    shutil.rmtree(out / _STAGING, ignore_errors=True)
+    return {"labelled": len(missing), "labeller": config.labeller if missing else "labels present"}
 
 
 def wanted_labels(config: AnnotateConfig) -> set[str]:

@@ -19,7 +19,7 @@ import contextlib
 import math
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,11 +29,10 @@ import torch
 from torch import Tensor
 
 from mudg.base import checkpoint, log, palette, store
-from mudg.base.config import result_settings
-from mudg.base.devices import choose_device, memory_of
+from mudg.base.devices import memory_of
 from mudg.base.errors import UsageError
 from mudg.base.processes import Interruption, one_torch_thread
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import FusedCloud, Gaussians, Render, Scene
 from mudg.core import losses, metrics, native_ops
 from mudg.core.pictures import panels_of
@@ -83,10 +82,8 @@ from mudg.stages.fitting.views import (
     load_recorded,
     load_virtual,
     training_frames,
-    virtual_sets,
 )
 from mudg.stages.fuse import fused_without_boxes
-from mudg.stages.radiance.loop import fit_radiance
 
 OUTPUT = VerbOutput(
     "fit", 3,
@@ -103,86 +100,61 @@ MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 """Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
 
 
-def run(
-    config: FitConfig, scene: Path, fused: Path | None, out: Path, *,
-    observations: Path | Sequence[Path] | None = None, start: Path | None = None, overwrite: bool = False,
-) -> Path:  # fmt: skip
-    """Fit a scene.
+def learns_virtual(method: str) -> bool:
+    """Whether fits of a method learn from virtual views."""
+    return bool({"virtual", "repaired"} & set(METHODS[method].supervision))
 
-    Args:
-        config: method, iterations, weights.
-        scene: scene directory (ingest).
-        fused: fused clouds (fuse); None: only for methods without Gaussians, which do not read them.
-        out: folder for the model.
-        observations: folder of virtual observation sets (synthesize), or several; needed by methods that use them, ignored by others.
-        start: folder of a finished fit of street_gaussians to the same scene and clouds to go on with: ``config.iterations`` more
-            steps, virtual views from the first of them on. None: a fit from nothing.
 
-    Returns:
-        ``out``, finished. An interrupted run continues when called again with the same arguments.
-
-    Raises:
-        UsageError: a method with virtual views without ``observations``. NumericsError: a loss or gradient is not
-        finite. InputError: damaged inputs, recorded views among ``observations``, or a ``start`` that does not fit.
-    """
-    if METHODS[config.method].scene == "radiance":
-        return _run_radiance(config, Path(scene), out, start, overwrite)
-    if fused is None:
+def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> None:
+    """UsageError where a method lacks what it needs: fused clouds, virtual views, a finished fit, or a setting."""
+    if not fused:
         raise UsageError(f"{config.method} needs fused clouds", remedy="run `mudg fuse` and give its folder as --fused")
-    recipe_of(config.method).check(config, start is not None)
-    learns_virtual = bool({"virtual", "repaired"} & set(METHODS[config.method].supervision))
-    folders = (observations,) if isinstance(observations, Path) else tuple(map(Path, observations or ()))
-    named = {"observations" + f" {n}" * (n > 0): folder for n, folder in enumerate(folders)}
-    if learns_virtual and not folders:
+    recipe_of(config.method).check(config, continued)
+    if learns_virtual(config.method) and not virtual:
         remedy = "run `mudg synthesize` and give its folder as --observations, or choose --method street_gaussians"
         raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
-    refuse_overlap(out, {
-        "scene": scene, "fused": fused, **named, "start": start,
-        "virtual.lpips-weights": config.virtual.lpips_weights,
-    })  # fmt: skip
-    inputs = {"scene": store.digest(Path(scene)), "fused": store.digest(Path(fused))}
-    begun = None if start is None else StartFit.of_folder(Path(start), inputs)
-    if begun is not None:
-        inputs["start"] = begun.digest
-    virtual: Mapping[str, ObservationSet] = {}
-    if learns_virtual:
-        virtual = virtual_sets(folders)
-        inputs |= {name: store.digest(folder) for name, folder in named.items()}
-    if config.virtual.lpips_weights:
-        inputs["lpips_weights"] = store.digest(Path(config.virtual.lpips_weights))
+
+
+def check_device(config: FitConfig) -> torch.device:
+    """Where it is fitted.
+
+    Raises:
+        UsageError: the method or the drawing cannot be there. ResourceError: there is no such device.
+    """
     device = drawing_device(config.device, "fit", config.raster)
     check_drawing(config, device)
-    # Clouds without boxes are fused again here; results of methods that took the one of `mudg fuse` are made again.
-    output = OUTPUT if METHODS[config.method].boxes else replace(OUTPUT, version=OUTPUT.version + 1)
-    folder = RunDir.open(out, output, result_settings(config), inputs, overwrite, {"scene": scene, "fused": fused})
-    if folder.complete:
-        return folder.reused()
+    return device
+
+
+@dataclass(frozen=True)
+class FitInputs:
+    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it goes on with."""
+
+    scene: Path
+    fused: Path
+    virtual: Mapping[str, ObservationSet] = field(default_factory=dict)
+    start: StartFit | None = None
+
+
+def write_fit(config: FitConfig, given: FitInputs, work: RunDir) -> dict[str, Any]:
+    """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest checkpoint.
+
+    Raises:
+        NumericsError: a loss or gradient is not finite. InputError: damaged inputs.
+    """
+    device = check_device(config)
     config = recipe_of(config.method).used(config)
-    if begun is not None:
+    if given.start is not None:
         config = whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
-        state = _prepare(config, FitInputs(Path(scene), Path(fused), virtual, begun), folder.path).to(device)
+        state = _prepare(config, given, work.path).to(device)
         with contextlib.closing(state.views):
-            optimise(state, config, folder)
+            optimise(state, config, work)
             add_certainty(state, config)
-    save_model(state.model, folder.path)
-    save_appearance(state.appearance, folder.path)
-    shutil.rmtree(folder.path / "steps", ignore_errors=True)
-    folder.finish(state.summary())
-    return folder.path
-
-
-def _run_radiance(config: FitConfig, scene: Path, out: Path, start: Path | None, overwrite: bool) -> Path:
-    """Fit a radiance field: it reads the scene alone (``stages/radiance/loop.py``)."""
-    if start is not None:
-        raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave --start-from out")
-    refuse_overlap(out, {"scene": scene})
-    device = choose_device(config.device, "fit")
-    folder = RunDir.open(out, OUTPUT, result_settings(config), {"scene": store.digest(scene)}, overwrite, {"scene": scene})
-    if folder.complete:
-        return folder.reused()
-    fit_radiance(config, read_scene(scene), folder, device)
-    return folder.path
+    save_model(state.model, work.path)
+    save_appearance(state.appearance, work.path)
+    shutil.rmtree(work.path / "steps", ignore_errors=True)
+    return state.summary()
 
 
 @dataclass
@@ -214,16 +186,6 @@ class FitState:
         """For run.json."""
         counts = {"gaussians": len(self.model.table), "steps": self.step - self.begun_at}
         return {**counts, "seconds": round(self.seconds, 2), **(self.last or {})}
-
-
-@dataclass(frozen=True)
-class FitInputs:
-    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it goes on with."""
-
-    scene: Path
-    fused: Path
-    virtual: Mapping[str, ObservationSet]
-    start: StartFit | None = None
 
 
 def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:

@@ -18,7 +18,6 @@ from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
 from mudg.core.color_match import match_cameras
 from mudg.core.fusion import (
@@ -32,14 +31,11 @@ from mudg.core.fusion import (
     separate,
 )
 from mudg.data.cloudfile import write_fused
-from mudg.data.scene import read_image, read_label, read_points, read_scene
+from mudg.data.scene import read_image, read_label, read_points
 from mudg.data.scene.check import check_distance
 from mudg.pages.top_view import TopView, draw_top_view
-from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.plan import read_list
 from mudg.stages.config import FuseConfig
 
-_OUTPUT = VerbOutput("fuse", 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png"))
 _TOP_VIEW_PX = (1400, 1000)
 MOST_NAMED = 3
 """Objects that are left out are named up to here, then counted."""
@@ -49,36 +45,20 @@ MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
 """To match the cameras' colours: sweeps, images of each camera per sweep, and how far in time they may be."""
 
 
-def run(config: FuseConfig, scene: Path, out: Path, *, overwrite: bool = False) -> Path:
-    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png`` to ``out``.
-
-    Args:
-        config: see ``FuseConfig``.
-        scene: scene directory or stored zip.
-        out: output folder; a finished result of the same configuration and scene is verified and reused.
-
-    Raises:
-        InputError: the scene is malformed, or has no LiDAR. UsageError: ``out`` holds something else.
-    """
-    refuse_overlap(out, {"scene": scene})
-    loaded = read_scene(scene)
-    refuse_without_lidar(loaded)
-    folder = RunDir.open(out, _OUTPUT, configuration.to_dict(config), {"scene": store.digest(scene)}, overwrite)
-    if folder.complete:
-        return folder.reused()
-    for finding in check_distance(loaded):
+def write_fusion(scene: Scene, config: FuseConfig, out: Path) -> dict[str, Any]:
+    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png`` to ``out``. Returns counts."""
+    for finding in check_distance(scene):
         log.warn(f"fuse: {finding.message}")
-    cloud, report = fuse_scene(loaded, config)
+    cloud, report = fuse_scene(scene, config)
     if report.sweeps and not len(cloud.static):
         log.warn(
             "fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`"
         )
     for words in (*describe(report), *describe_colors(cloud.colors)):
         log.info(f"fuse: {words}")
-    write_fused(folder.path, cloud, report_record(report, rules_of(config)))
-    store.write_image(folder.path / "top.png", top_view(loaded, cloud, report))
-    folder.finish({"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in})
-    return folder.path
+    write_fused(out, cloud, report_record(report, rules_of(config)))
+    store.write_image(out / "top.png", top_view(scene, cloud, report))
+    return {"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in}
 
 
 def refuse_without_lidar(scene: Scene) -> None:
@@ -87,14 +67,6 @@ def refuse_without_lidar(scene: Scene) -> None:
         raise InputError("the log has no LiDAR sweeps, which a fused cloud, and what starts from it, need", where=scene.root,
             expected="sweeps of at least one LiDAR", got=f"{len(scene.frames)} images only",
             remedy="give a log with LiDAR; ingest, annotate, export, and fit with emernerf work without")  # fmt: skip
-
-
-def run_many(
-    config: FuseConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
-) -> dict[str, Any]:
-    """``run`` for every scene of a list; see ``stages/batches/listed.py``."""
-    entries = read_list(listed)
-    return run_listed(ListedRun("fuse", config, entries, out, jobs, overwrite, shard, listed))
 
 
 def fuse_scene(scene: Scene, config: FuseConfig) -> tuple[FusedCloud, FusionReport]:

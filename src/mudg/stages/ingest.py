@@ -9,65 +9,50 @@ from pathlib import Path
 from typing import Any
 
 from mudg.base import log, store
-from mudg.base.config import to_dict
 from mudg.base.errors import InputError, UsageError
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap, run_state
+from mudg.base.run_folder import RunDir, run_state
 from mudg.base.types import Scene
 from mudg.data.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.data.importers.common import processors
 from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
-from mudg.data.scene import SCENE_FILES, SceneWriter, alignment, read_scene
+from mudg.data.scene import SceneWriter, alignment, read_scene
 from mudg.data.scene import check as scene_check
 from mudg.pages import contact_sheet
-from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.plan import OF_A_LINE, read_list
 from mudg.stages.config import IngestConfig
 
 CITY = "city"
-_OUTPUT = VerbOutput("ingest", 1, (*SCENE_FILES, contact_sheet.NAME))
 
 
-def run(config: IngestConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> Path:
-    """Make a scene directory from ``source``.
-
-    Args:
-        config: see ``IngestConfig``.
-        source: the word ``city``, the folder of a dataset log (its format is recognised), or a scene (directory or
-            stored zip), which is checked and copied.
-        out: output folder; a finished result of the same configuration and source is verified and reused. What an import that
-            failed or was killed left there is replaced; one that fails in a new or empty folder leaves nothing.
-
-    Raises:
-        InputError: the log is missing, malformed or contradictory. UsageError: ``out`` holds something else.
-    """
-    source = str(source)
-    refuse_overlap(out, {"log": "" if source == CITY else source, "poses": config.poses, "boxes": config.boxes})
-    kind = CITY if source == CITY else _kind(config, Path(source))
-    if kind in IMPORTERS:
-        files = files_of(kind, Path(source), import_options(config))
-        refuse_overlap(out, {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))})
-    inputs = {} if kind == CITY else {"source": source_digest(Path(source), kind, config)}
-    idle = ("workers",) if source == CITY else ("workers", "city")  # what the result does not depend on
-    settings = {name: value for name, value in to_dict(config).items() if name not in idle}
-    folder = RunDir.open(out, _OUTPUT, settings, inputs, overwrite or _abandoned(out))
-    if folder.complete:
-        return folder.reused()
-    try:
-        return _fill(folder, kind, config, Path(source))
-    except BaseException:
-        if folder.fresh and not (folder.path / "scene.json").is_file():
-            folder.discard()  # nothing was made: the next try may ask for something else
-        raise
+def files_read(config: IngestConfig, source: Path, kind: str) -> dict[str, Path]:
+    """Files of the log that an import of this kind reads, by names for messages."""
+    if kind not in IMPORTERS:
+        return {}
+    files = files_of(kind, source, import_options(config))
+    return {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))}
 
 
-def _abandoned(out: Path) -> bool:
+def is_abandoned(out: Path) -> bool:
     """Whether an import that is not finished made no scene at ``out`` yet."""
     state = run_state(out)
     return state.get("verb") == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file()
 
 
-def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path:
-    """Make the scene in its folder, draw its contact sheet and finish the run."""
+def write_scene(config: IngestConfig, source: Path, kind: str, work: RunDir) -> dict[str, Any]:
+    """Make the scene in its folder and draw its contact sheet; returns a summary. An import that fails in a new or empty folder leaves
+    nothing.
+
+    Raises:
+        InputError: the log is malformed or contradictory.
+    """
+    try:
+        return _fill(work, kind, config, source)
+    except BaseException:
+        if work.fresh and not (work.path / "scene.json").is_file():
+            work.discard()  # nothing was made: the next try may ask for something else
+        raise
+
+
+def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict[str, Any]:
     if (folder.path / "scene.json").is_file():
         scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
     else:
@@ -90,8 +75,7 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> Path
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
         log.info(f"ingest: check {folder.out / sheet.name}")
-    folder.finish({**summary, **({} if kind == CITY else _alignment(scene))})
-    return folder.path
+    return {**summary, **({} if kind == CITY else _alignment(scene))}
 
 
 def _alignment(scene: Scene) -> dict[str, Any]:
@@ -102,20 +86,17 @@ def _alignment(scene: Scene) -> dict[str, Any]:
     return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
 
 
-def run_many(
-    config: IngestConfig, listed: Path, out: Path, shard: str = "", jobs: int = 0, overwrite: bool = False
-) -> dict[str, Any]:
-    """``run`` for every log of a list; see ``stages/batches/listed.py``. A line may set format, sequence, frames, cameras (with
-    commas), poses, boxes and seed (of a city) for itself."""
-    entries = read_list(listed, OF_A_LINE)
-    return run_listed(ListedRun("ingest", config, entries, out, jobs, overwrite, shard, listed))
-
-
 _SCENE = "scene"
 
 
-def _kind(config: IngestConfig, source: Path) -> str:
-    """Which format ``source`` has, or ``scene``."""
+def kind_of(config: IngestConfig, source: Path) -> str:
+    """Which format ``source`` has: one of a log, ``city`` or ``scene``.
+
+    Raises:
+        UsageError: there is no such format. InputError: there is no log, or of no format that is known.
+    """
+    if str(source) == CITY:
+        return CITY
     if config.format not in ("auto", *IMPORTERS):
         raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
             got=config.format)  # fmt: skip

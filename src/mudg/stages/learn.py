@@ -21,7 +21,7 @@ import hashlib
 import importlib.util
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from mudg.base.config import to_dict
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.processes import Interruption
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
+from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.data.clips import from_log
 from mudg.data.clips.shards import ShardSource
 from mudg.models.diffusion import SampleRequest
@@ -59,82 +59,76 @@ from mudg.stages.learning.precision import choose_bf16
 from mudg.stages.learning.scene_list import ListedShards, is_list, read_list
 from mudg.stages.learning.state import TrainingState, mean_of
 
-_OUTPUT = VerbOutput(
-    "learn", 1,
-    ("clips/*.safetensors", f"clips/{from_log.INDEX}", "codec/", "steps/", f"{learn_clips.CACHE}/", "samples/*.png", "tensorboard/",
-     "loss.png", "metrics.json", "model/*", "model.part/"),
-)  # fmt: skip
+
+def check(config: LearnConfig) -> LearnConfig:
+    """The configuration; without renders where the condition has none.
+
+    Raises:
+        UsageError: settings that do not go together, or a condition that cannot be made. ResourceError: a package is missing.
+    """
+    if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
+            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
+    if config.data.condition != "full":
+        if config.data.scenes:
+            raise UsageError("this condition is made of generated cities only", where="--data.condition", got="--data.scenes",
+                             remedy="leave one of them out")  # fmt: skip
+        config = learn_clips.without_renders(config)
+    learn_clips.is_streamed(config)  # refuses what does not go together
+    return config
 
 
-def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
-    """Train a model, from nothing or from an earlier one; returns the folder of the exported model (`OUT/model`).
+def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callable[[], RunDir]) -> None:
+    """Train a model, from nothing or from an earlier one, and export it to `OUT/model`.
 
     Under `torchrun` every process calls this with the same arguments; `out` lies on a file system that all see.
+
+    Args:
+        open_work: opens the folder, in the leader alone; a finished result is verified and used again.
 
     Raises:
         NumericsError: a loss or gradient is not finite (names the term, the step and the process; parameters are untouched).
         InputError: logs or clips that cannot be used. ResourceError, UsageError: see `RunDir.open`.
     """
-    if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
-            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
-    config = _checked_condition(config)
-    learn_clips.is_streamed(config)  # refuses what does not go together
     torch.set_num_threads(config.threads)
     with parallel.join_processes(config.compute.device) as ranks:
         model, fresh = starting_model(config)
-        directory = _open(config, out, overwrite, ranks)
-        if directory is None:
-            return out / "model"
+        opened: list[RunDir] = []
+
+        def open_run() -> str:
+            opened.append(open_work())
+            return "" if opened[0].complete else str(opened[0].path)
+
+        path = ranks.leader_does(open_run)
+        if not path:
+            return
+        work = opened[0] if ranks.leads else RunDir(out, Path(path), output, "", {})
         try:
-            _train(model, fresh, config, directory, ranks)
+            _train(model, fresh, config, work, ranks)
         except KeyboardInterrupt:
             if ranks.leads:
-                directory.pause()
+                work.pause()
             raise
-    return out / "model"
 
 
-def _checked_condition(config: LearnConfig) -> LearnConfig:
-    """The configuration; without renders where the condition has none. UsageError where the condition cannot be made."""
-    if config.data.condition == "full":
-        return config
-    if config.data.scenes:
-        raise UsageError("this condition is made of generated cities only", where="--data.condition", got="--data.scenes",
-                         remedy="leave one of them out")  # fmt: skip
-    return learn_clips.without_renders(config)
+def inputs_of(config: LearnConfig) -> dict[str, str]:
+    """Digests of what a training starts from and learns from."""
+    inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
+    if is_list(config.data.scenes):
+        inputs["list of scenes"] = hashlib.sha256(Location.of(config.data.scenes[0]).load()).hexdigest()
+    for number, source in enumerate(_sources(config)):
+        inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
+    return inputs
 
 
-def _open(config: LearnConfig, out: Path, overwrite: bool, ranks: Ranks) -> RunDir | None:
-    """The run's folder, locked by the leader; None if a finished result is there and was verified."""
-    opened: list[RunDir] = []
-    settings = {name: value for name, value in to_dict(config).items() if name != "compute"}
-
-    def open_run() -> str:
-        listed = is_list(config.data.scenes)
-        sources = [] if listed else [from_log.log_source(text) for text in config.data.scenes]
-        _refuse_overlap(config, out, sources, overwrite)
-        inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
-        if listed:
-            inputs["list of scenes"] = hashlib.sha256(Location.of(config.data.scenes[0]).load()).hexdigest()
-        for number, source in enumerate(sources):
-            inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
-        opened.append(RunDir.open(out, _OUTPUT, settings, inputs, overwrite))
-        if opened[0].complete:
-            opened[0].reused()
-        return "" if opened[0].complete else str(opened[0].path)
-
-    path = ranks.leader_does(open_run)
-    if not path:
-        return None
-    return opened[0] if ranks.leads else RunDir(out, Path(path), _OUTPUT, "", {})
+def _sources(config: LearnConfig) -> list[from_log.LogSource]:
+    return [] if is_list(config.data.scenes) else [from_log.log_source(text) for text in config.data.scenes]
 
 
-def _refuse_overlap(config: LearnConfig, out: Path, sources: Sequence[from_log.LogSource], overwrite: bool) -> None:
-    """UsageError where `out` touches something that is read. Clips may lie in `out` where they do by default, unless a result there
-    is to be replaced."""
-    read: dict[str, Path | str] = {"start": mdm_files.folder_of(config.start) if config.start else ""}
-    for number, source in enumerate(sources):
+def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Path | str | None]:
+    """What is read, by names for messages. Clips may lie in `out` where they do by default, unless a result there is to be replaced."""
+    read: dict[str, Path | str | None] = {"start": mdm_files.folder_of(config.start) if config.start else ""}
+    for number, source in enumerate(_sources(config)):
         read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
     if is_list(config.data.scenes):
         listed = [text for scene in read_list(config.data.scenes[0]).scenes for text in scene.path.split("=")]
@@ -142,7 +136,7 @@ def _refuse_overlap(config: LearnConfig, out: Path, sources: Sequence[from_log.L
         read["list"] = config.data.scenes[0] if Location.of(config.data.scenes[0]).local is not None else ""
     clips = "" if learn_clips.clips_at_address(config) else config.data.clips
     own_clips = not overwrite and Path(clips).resolve() == (out / "clips").resolve()
-    refuse_overlap(out, {**read, "clips": "" if own_clips else clips})
+    return {**read, "clips": "" if own_clips else clips}
 
 
 def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:

@@ -12,18 +12,16 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import torch
 
 from mudg import native
-from mudg.base import log, memory, store
-from mudg.base.config import result_settings
+from mudg.base import log, memory
 from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.palette import CLASSES
 from mudg.base.processes import computed_ahead
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Observation, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
@@ -32,13 +30,12 @@ from mudg.data.clips.weathered import InWeather
 from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript
 from mudg.data.exporters.video import write_mp4
-from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, read_observations
+from mudg.data.observations import ObservationWriter, read_observations
 from mudg.data.scene import read_scene
-from mudg.models.mdm.files import digest
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import RenderConfig
 from mudg.stages.editing.apply import scene_seen_by
-from mudg.stages.editing.carried import FACT, EditedDrive, carry_out, read_and_digest
+from mudg.stages.editing.carried import FACT, EditedDrive, carry_out
 from mudg.stages.editing.harmonised import EditedSources, Harmoniser, RepairedViews, check_paths
 from mudg.stages.editing.harmonised_weather import WeatherHarmoniser, harmonises_weather
 from mudg.stages.editing.weathered import Drawer, conditions_of, in_weather, weather_of
@@ -55,82 +52,71 @@ AHEAD_PIXELS: Final = 1_000_000
 """Larger views are drawn one at a time by all threads: less memory."""
 Drawers = Callable[[Sequence[View]], AbstractContextManager[Iterator[Observation]]]
 """Draws views in order."""
-_OUTPUT = VerbOutput("render", 2, ("*.mp4", *below("*", OBSERVATION_FILES)))
 
 
-def run(
-    config: RenderConfig, scene: Path, model: Path, out: Path, *,
-    edits: Path | None = None, fused: Path | None = None, overwrite: bool = False,
-) -> Path:  # fmt: skip
-    """Render every camera and shift of the configuration.
+Edited = tuple[Scene, SceneModel, EditedDrive | None]
+"""Scene and fit as they are rendered, and what an edit script did to them."""
+
+
+def prepare(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None) -> Edited | None:
+    """Carry out the edit script, if there is one: what cannot be done is told before anything is written.
 
     Args:
-        scene: scene directory; gives cameras, times and the path of the vehicle.
-        model: folder made by fit.
-        out: one observation folder (and video) per trajectory.
-        edits: an edit script to carry out before.
         fused: fused clouds of the scene, for ``config.harmonize``.
-
-    Returns:
-        ``out``, finished; an interrupted run continues with the next missing view.
     """
-    inputs = {"scene": store.digest(Path(scene)), "model": store.digest(Path(model))}
-    script, named = None, {}
-    if edits is not None:
-        script, inputs["edits"] = read_and_digest(Path(edits))
-        named = {f"{edits}: {name}": path for name, path in script.files().items()}
-    refuse_overlap(out, {"scene": scene, "model": model, "edits": edits, "fused": fused, **named})
-    if config.harmonize.on:
-        inputs |= _harmonised_inputs(config, edits, fused)
-    radiance, followers = kind_of(Path(model)) == RADIANCE, list[RepairedViews]()
+    radiance = kind_of(model) == RADIANCE
     if radiance and (config.remove_tracks or script is not None):
         raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
             remedy="leave --remove-tracks and --edits out")  # fmt: skip
-    device = choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
-    asked = fused if config.harmonize.on else None
-    edited = None if script is None else _edited(scene, model, script, asked)  # what cannot be done is told before anything is written
+    choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
+    edited = None if script is None else _edited(scene, model, script, fused if config.harmonize.on else None)
     if edited is not None and config.harmonize.on:
         check_paths(config.harmonize, {path.name: len(path) for path in trajectories(edited[0], config)})
-    folder = RunDir.open(out, _OUTPUT, result_settings(config), inputs, overwrite)
-    if folder.complete:
-        return folder.reused()
-    if radiance:
-        loaded, (draw, source) = read_scene(Path(scene)), _field_drawer(config, Path(model), device)
+    return edited
+
+
+def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, out: Path) -> dict[str, Any]:
+    """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a summary. An
+    interrupted run continues with the next missing view.
+
+    Args:
+        scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare`` made of them.
+    """
+    followers = list[RepairedViews]()
+    if kind_of(model) == RADIANCE:
+        device = choose_device(config.device, "render")
+        loaded, (draw, source) = read_scene(scene), _field_drawer(config, model, device)
     else:
+        device = drawing_device(config.device, "render", config.raster)
         loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
         if config.harmonize.on and drive is not None:
-            draw = _repaired(config, (drive, fitted), (Path(scene), Path(model)), draw)
+            draw = _repaired(config, (drive, fitted), (scene, model), draw)
             followers.append(draw)
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
         if conditions is not None:
             how = weather_of(draw, conditions, loaded)
             draw = in_weather(draw, how)
             if config.harmonize.on and drive is not None and harmonises_weather(config.harmonize, how):
-                draw = _corrected(config, (drive, fitted), Path(scene), (draw, how))
+                draw = _corrected(config, (drive, fitted), scene, (draw, how))
                 followers.append(draw)
     paths = trajectories(loaded, config)
     _require_memory(paths)
     threads = 1 if followers or device.type != "cpu" else native.threads()
-    try:
-        with (
-            log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
-            memory_of(device, "render"), ThreadPoolExecutor(1) as encoder,
-        ):  # fmt: skip
-            videos = list[Future[None]]()
-            for path in paths:
-                for follower in followers:
-                    follower.follow(path)
-                _render_trajectory(_several(draw, threads), path, folder.path / path.name, source, bar)
-                if config.video:
-                    videos.append(encoder.submit(_write_video, folder.path / path.name, folder.path / f"{path.name}.mp4", config.fps))
-            for video in videos:
-                video.result()
-    except KeyboardInterrupt:
-        folder.pause()
-        raise
-    folder.finish({"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)})
-    return folder.path
+    with (
+        log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
+        memory_of(device, "render"), ThreadPoolExecutor(1) as encoder,
+    ):  # fmt: skip
+        videos = list[Future[None]]()
+        for path in paths:
+            for follower in followers:
+                follower.follow(path)
+            _render_trajectory(_several(draw, threads), path, out / path.name, source, bar)
+            if config.video:
+                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4", config.fps))
+        for video in videos:
+            video.result()
+    return {"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)}
 
 
 def _require_memory(paths: Sequence[Trajectory]) -> None:
@@ -150,18 +136,6 @@ def _edited(
         return loaded, fitted, None
     drive = carry_out(script, fitted, loaded, None if fused is None else read_fused(Path(fused)))
     return drive.scene or loaded, drive.model(fitted), drive
-
-
-def _harmonised_inputs(config: RenderConfig, edits: Path | None, fused: Path | None) -> dict[str, str]:
-    """What else a harmonised render reads.
-
-    Raises:
-        UsageError: no edit script or no fused clouds.
-    """
-    if edits is None or fused is None:
-        raise UsageError("harmonising repairs what an edit script touched, from the fused clouds", where="--harmonize.on",
-            got=f"no --{'edits' if edits is None else 'fused'}", remedy="give --edits and --fused, or leave it out")  # fmt: skip
-    return {"fused": store.digest(Path(fused)), "diffusion": digest(config.harmonize.model)}
 
 
 def _repaired(

@@ -21,20 +21,17 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from mudg import native
-from mudg.base import config as configuration
 from mudg.base import log, palette, store
 from mudg.base.devices import choose_device
-from mudg.base.errors import UsageError
 from mudg.base.processes import computed_ahead, one_torch_thread
 from mudg.base.records import understood
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project, view_metrics
 from mudg.core.perceptual import LPIPS_EPSILON
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
 from mudg.core.view_facts import ViewFacts
 from mudg.data.cloudfile import read_fused
-from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
+from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_scene
 from mudg.models.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
 from mudg.models.mdm import files as mdm_files
@@ -42,7 +39,6 @@ from mudg.pages import score_tables
 from mudg.stages.config import ScoreConfig
 from mudg.stages.fitting.perception import lpips_network
 from mudg.stages.score_truth import ViewTruth, stored_truth, truth_of
-from mudg.stages.scoring.distributions import FEATURES_FOLDER
 from mudg.stages.scoring.facts import FactMaker, known_of, vehicles_of
 from mudg.stages.scoring.trajectories import Baseline, PairDistance, Reference, ScoredTrajectory, trajectories_of
 from mudg.stages.scoring.whole_sets import BASELINE, anchors_of, set_scores_of
@@ -56,49 +52,22 @@ LPIPS_FILES: Final[Mapping[str, tuple[str, LpipsTrunk]]] = {
     "lpips_squeeze_weights": ("lpips_squeeze", "squeeze"),
 }
 """Setting that names a file -> row of the table and the network in the file."""
-FILES: Final = (*LPIPS_FILES, "fid_weights", "fvd_weights", "dino_weights", "clip_weights", "video_features", "detections", "lanes")
-"""Settings that name files and folders to read."""
 DEPTH_LIMIT_M: Final = 80.0
-_OUTPUT: Final = VerbOutput(
-    "score", 6,
-    ("metrics.json", "metrics.md", "errors/*.png", f"{FEATURES_FOLDER}/*.safetensors",
-     *below("truth/*", OBSERVATION_FILES), *below(f"{BASELINE}/*", OBSERVATION_FILES)),
-)  # fmt: skip
 
 
-def run(
-    config: ScoreConfig, scene: Path, methods: Mapping[str, Path], out: Path, *, fused: Path | None = None,
-    truth: Path | None = None, overwrite: bool = False,
-) -> Path:  # fmt: skip
-    """Score every trajectory of every method and write ``out``.
+def write_scores(
+    config: ScoreConfig, scene: Path, methods: Mapping[str, Path], out: Path, *, fused: Path | None = None, truth: Path | None = None
+) -> dict[str, Any]:  # fmt: skip
+    """Score every trajectory of every method; returns a summary.
 
     Args:
-        config: settings.
-        scene: the scene that was rendered.
-        methods: name -> folder of observation folders (output of render or synthesize).
-        out: folder to write.
+        scene: the scene that was rendered. methods: name -> folder of observation folders (output of render or synthesize).
         fused: clouds made by fuse, for the baseline; without them there is none.
-        truth: folder of ``score_truth.write_truth`` for this scene, to be read instead of drawing the truth again.
-        overwrite: replace what other settings or inputs left in ``out``.
+        truth: folder of ``DrawTruth`` for this scene, to be read instead of drawing the truth again.
 
     Raises:
-        UsageError: no method given. InputError: nothing to score, or methods disagree about a trajectory's views.
+        InputError: nothing to score, or methods disagree about a trajectory's views.
     """
-    if not methods:
-        raise UsageError("nothing to score", expected="at least one method with its folder of rendered views")
-    files = {name: getattr(config, name) for name in FILES}
-    refuse_overlap(out, {"scene": scene, **methods, "fused": fused, "truth": truth, **{n.replace("_", "-"): p for n, p in files.items()}})
-    others = {
-        "fused": fused if config.baseline else None,
-        **{name: Path(path) if path else None for name, path in files.items()},
-        "truth": truth,
-    }
-    given = {"scene": scene, **methods, **{name: path for name, path in others.items() if path is not None}}
-    inputs = {name: store.digest(path) for name, path in given.items()}
-    choose_device(config.device, "networks of the scores")  # refused before anything is written
-    work = RunDir.open(out, _OUTPUT, configuration.result_settings(config), inputs, overwrite)
-    if work.complete:
-        return work.reused()
     recorded = read_scene(scene)
     trajectories = trajectories_of(config, recorded, methods)
     reference = Reference(
@@ -108,13 +77,13 @@ def run(
         error_pictures=config.error_pictures, distances=_distances(config), distance_views=config.perceptual_views,
         facts=FactMaker(recorded), vehicles=vehicles_of(recorded),
     )  # fmt: skip
-    sets = set_scores_of(config, recorded, work.path)  # before the work: the weights may be unusable
+    sets = set_scores_of(config, recorded, out)  # before the work: the weights may be unusable
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
         for trajectory in trajectories:
             bar.update(trajectory.name)
-            results += _score(trajectory, reference, work.path, bar.advance)
-    sets.add_to(results, trajectories, reference, work.path)
+            results += _score(trajectory, reference, out, bar.advance)
+    sets.add_to(results, trajectories, reference, out)
     names = [*([BASELINE] if reference.baseline is not None else []), *methods]
     rows = {
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
@@ -124,10 +93,9 @@ def run(
     records = [trajectory.record() for trajectory in trajectories]
     document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows,
         {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors, "lpips": _lpips_record(config), **sets.records()})  # fmt: skip
-    store.write_json(work.path / "metrics.json", document)
-    store.write_text(work.path / "metrics.md", score_tables.markdown(document))
-    work.finish({"trajectories": len(trajectories), "methods": names})
-    return work.path
+    store.write_json(out / "metrics.json", document)
+    store.write_text(out / "metrics.md", score_tables.markdown(document))
+    return {"trajectories": len(trajectories), "methods": names}
 
 
 def _distances(config: ScoreConfig) -> dict[str, PairDistance]:

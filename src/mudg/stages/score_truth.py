@@ -19,7 +19,6 @@ from torch import Tensor
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Frame, Observation, Scene, Trajectory, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_nearest, resize_rgb
@@ -27,7 +26,7 @@ from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import visible_depth
 from mudg.data.city import CityWorld
 from mudg.data.city import logs as city_logs
-from mudg.data.observations import OBSERVATION_FILES, ObservationWriter, list_observation_sets, read_observations
+from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
 from mudg.data.scene import read_image, read_label, read_points, read_scene
 
 MOVING_FILE: Final = "moving.safetensors"
@@ -35,7 +34,6 @@ SAME_SWEEP_S: Final = 0.05
 MAX_LIDAR_M: Final = 100.0
 SAME_TIME_S: Final = 1e-4
 SAME_PLACE_M: Final = 1e-3
-_OUTPUT: Final = VerbOutput("truth", 2, below("*", (*OBSERVATION_FILES, MOVING_FILE)))
 
 
 @dataclass(frozen=True)
@@ -88,27 +86,19 @@ def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewT
     return ViewTruth(world.observation(view, truth), dynamic, truth.instance, world.markings(view, truth))
 
 
-def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, overwrite: bool = False) -> Path:
-    """Draw the truth of a generated city on some trajectories once, for many scores (``score.run(truth=...)``).
+def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> None:
+    """Draw the truth of a generated city on some trajectories once, for many scores.
 
     Raises:
         InputError: the scene was not generated.
     """
-    refuse_overlap(out, {"scene": scene})
-    views = [
-        [v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width] for path in trajectories for v in path.views
-    ]
-    asked = {"trajectories": [path.name for path in trajectories], "views": views}
-    folder = RunDir.open(out, _OUTPUT, asked, {"scene": store.digest(scene)}, overwrite)
-    if folder.complete:
-        return folder.reused()
     truth = truth_of(read_scene(scene))
     if not truth.exact:
         raise InputError("only a generated city has ground truth at every view", where=str(scene))
     with log.task("truth", sum(map(len, trajectories))) as bar:
         for path in trajectories:
             maps: dict[str, list[NDArray[Any]]] = {"moving": [], "instance": [], "marking": []}
-            with ObservationWriter(folder.path / path.name, path.name, "truth", "recorded") as writer:
+            with ObservationWriter(out / path.name, path.name, "truth", "recorded") as writer:
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None or true.instance is None or true.marking is None:
@@ -121,9 +111,7 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path, *, o
                     else:
                         writer.add(true.seen)
                     bar.advance()
-            store.write_safetensors(folder.path / path.name / MOVING_FILE, {k: np.stack(v) for k, v in maps.items()})
-    folder.finish({"trajectories": [path.name for path in trajectories]})
-    return folder.path
+            store.write_safetensors(out / path.name / MOVING_FILE, {k: np.stack(v) for k, v in maps.items()})
 
 
 def stored_truth(folder: Path) -> Truth:

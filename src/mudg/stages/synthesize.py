@@ -27,11 +27,9 @@ from torch.nn import functional
 
 from mudg import native
 from mudg.base import log, memory, palette, store
-from mudg.base.config import result_settings
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.records import understood
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
 from mudg.base.types import Condition, Frame, FusedCloud, Observation, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
@@ -45,18 +43,16 @@ from mudg.data.clips.vacated import VacatedAt
 from mudg.data.clips.weathered import InWeather
 from mudg.data.cloudfile import read_fused
 from mudg.data.edits import EditScript
-from mudg.data.observations import OBSERVATION_FILES, ObservationWriter
+from mudg.data.observations import ObservationWriter
 from mudg.data.scene import read_image, read_label, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
 from mudg.models.mdm.codec import Modality
-from mudg.models.mdm.files import digest, folder_of
 from mudg.models.mdm.model import MDM
 from mudg.models.published.files import is_published
 from mudg.models.scene.model import SceneModel
 from mudg.stages import fuse
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.editing import weathered as editing_weather
-from mudg.stages.editing.carried import read_and_digest
 from mudg.stages.editing.vacated import DriveOfEdits, drive_of_edits, photos_of_edited, vacated_at
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.rendering import raster_of, render_view
@@ -76,48 +72,35 @@ PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
 """What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's frames. Measured:
 2.0 GiB at 1242x375 with windows of eight frames, 3.85 GiB at 3840x2160 with three, where conditions lie in files (4.5 GiB before)."""
 WINDOW_FRAMES = 8
-COMPUTE = ("offload", "compiled")
-"""Settings that say how is computed, not what: a result may be resumed and reused under others."""
-_OUTPUT = VerbOutput("synthesize", 2, below("*", (*OBSERVATION_FILES, "overview.png", FITS, "state/")))
 
 
-def run(
-    config: SynthesizeConfig, scene: Path, fused: Path, out: Path, *,
-    fitted: Path | None = None, edits: Path | None = None, overwrite: bool = False,
-) -> Path:  # fmt: skip
-    """Generate all trajectories of the configuration; returns `out`, one folder of observations per trajectory inside.
+@dataclass(frozen=True, slots=True)
+class JobInputs:
+    """What every trajectory is made from: folders of the scene, its fused clouds and its fit, and the edit script."""
 
-    Args:
-        config: see `SynthesizeConfig`.
-        scene: scene directory or stored zip. fused: output of fuse for this scene.
-        out: a finished result of the same configuration and inputs is verified and reused.
-        fitted: output of fit for this scene, whose renders become part of the condition. For models that were trained with renders, and
-            for the weather and light of `edits`.
-        edits: an edit script; views are made of the drive as it says.
+    scene: Path
+    fused: Path
+    fitted: Path | None = None
+    script: EditScript | None = None
+
+
+def read_drive(config: SynthesizeConfig, given: JobInputs) -> Scene:
+    """The scene whose cameras are moved, as the edit script leaves it: what cannot be done is told here, before anything is written."""
+    loaded = read_scene(given.scene)
+    if given.fitted is not None:
+        model_of_scene(given.fitted, loaded)  # refuses the fit of another scene
+    return loaded if given.script is None else _edited(config, given, given.script, loaded).scene
+
+
+def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: Path) -> dict[str, Any]:
+    """Generate all trajectories of the configuration, one folder of observations each; returns a summary.
 
     Raises:
-        UsageError: unknown camera, nothing to make, model that does not fit. InputError: scene, cloud or model malformed.
+        UsageError: unknown camera, nothing to make.
     """
-    script, named, asked = None, {}, {}
-    if edits is not None:
-        script, asked["edits"] = read_and_digest(Path(edits))
-        named = {f"{edits}: {name}": path for name, path in script.files().items()}
-    refuse_overlap(out, {"scene": scene, "fused": fused, "fitted": fitted, "edits": edits, "model": folder_of(config.model), **named})
-    weather = script is not None and shows_weather(config, script, fitted is not None)
-    config = loading.check_config(config, fitted is not None, weather=weather)
-    inputs = {"scene": store.digest(scene), "fused": store.digest(fused), "model": digest(config.model), **asked}
-    loaded = read_scene(scene)
-    if fitted is not None:
-        inputs["fitted"] = store.digest(fitted)
-        model_of_scene(fitted, loaded)
-    loaded = loaded if script is None else _edited(config, script, (loaded, fused, fitted)).scene
-    settings = {name: value for name, value in result_settings(config).items() if name not in COMPUTE}
-    directory = RunDir.open(out, _OUTPUT, settings, inputs, overwrite)
-    if directory.complete:
-        return directory.reused()
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not (config.shifts_m or config.paths):
-        raise UsageError("nothing to synthesize", where=str(scene), expected="at least one camera and one shift")
+        raise UsageError("nothing to synthesize", where=str(given.scene), expected="at least one camera and one shift")
     paths = [
         *(trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m),
         *(trajectory.named(loaded, camera, name) for camera in cameras for name in config.paths),
@@ -129,16 +112,13 @@ def run(
     started = time.monotonic()
     processes = config.processes or usual_processes(config, paths)
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
-    inputs_of = JobInputs(Path(scene), Path(fused), fitted, script)
-    jobs = [(config, inputs_of, directory.path, path, model) for path in paths]
     try:
-        frames = _run_jobs(jobs, names, processes)
+        frames = _run_jobs([(config, given, out, path, model) for path in paths], names, processes)
     finally:
         _drive_again.cache_clear()
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
-    directory.finish({"trajectories": names, "views": frames})
-    return directory.path
+    return {"trajectories": names, "views": frames}
 
 
 def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> int:
@@ -159,14 +139,14 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
     return possible
 
 
-def _edited(config: SynthesizeConfig, script: EditScript, given: tuple[Scene, Path, Path | None]) -> DriveOfEdits:
-    """The drive that a script makes of scene, clouds and fit; what cannot be done is told here, before anything is written."""
-    scene, fused, fitted = given
+def _edited(config: SynthesizeConfig, given: JobInputs, script: EditScript, scene: Scene) -> DriveOfEdits:
+    """The drive that the script makes of scene, clouds and fit."""
     if config.condition == FREEVS:
         raise UsageError("this condition is made of recorded sweeps, which show no edits", where="--condition", got=FREEVS,
             remedy="edit a whole run with `mudg edit` and give its scene")  # fmt: skip
-    told = not shows_weather(config, script, fitted is not None)
-    return drive_of_edits(script, scene, read_fused(fused), None if fitted is None else load_model(fitted), told=told)
+    told = not shows_weather(config, script, given.fitted is not None)
+    fitted = None if given.fitted is None else load_model(given.fitted)
+    return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told)
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
@@ -237,16 +217,6 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
     """The cloud without its points' classes."""
     bare = lambda points: replace(points, semantics=None)  # noqa: E731
     return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()}, cloud.colors)
-
-
-@dataclass(frozen=True, slots=True)
-class JobInputs:
-    """What every trajectory is made from: folders of the scene, its fused clouds and its fit, and the edit script."""
-
-    scene: Path
-    fused: Path
-    fitted: Path | None = None
-    script: EditScript | None = None
 
 
 def make_trajectory(

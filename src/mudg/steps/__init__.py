@@ -31,7 +31,7 @@ _HOMES: Final[Mapping[str, str]] = {
     "batch run": "mudg.steps.batch:BatchRun",
     "batch status": "mudg.steps.batch:BatchProgress",
     "batch retry": "mudg.steps.batch:BatchRetry",
-    "bench": "mudg.steps.bench:Bench",
+    "bench": "mudg.benchmarks.step:Bench",
     "convert": "mudg.steps.convert:Convert",
 }
 VERBS: Final = tuple(_HOMES)

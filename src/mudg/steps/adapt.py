@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.learn import Learn
 from mudg.steps.outputs import Output
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.stages.config import AdaptConfig
+    from mudg.base.run_folder import RunDir
+    from mudg.stages.adapt import PlannedAdaptation
+    from mudg.stages.config import AdaptConfig, FitConfig
 
 
 class Adapt(Output):
@@ -22,6 +29,7 @@ class Adapt(Output):
     )
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "model"
+    version, files = 2, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/")
     short = ("model", "cameras", "shifts_m", "steps", "lr", "fit_iterations", "precision", "device", "processes", "seed")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
@@ -34,8 +42,45 @@ class Adapt(Output):
     def required(self) -> tuple[str, ...]:
         return ("fused", "fitted")
 
-    def run(self) -> Path:
-        from mudg.stages import adapt
+    def checked(self) -> Self:
+        from mudg.base.devices import NETWORK_KINDS, choose_device
 
-        fused, fitted = cast("Path", self.fused), cast("Path", self.fitted)
-        return adapt.run(self.settings, self.scene, fused, fitted, self.out, overwrite=self.overwrite)
+        device = choose_device(self.settings.device, "diffusion model", NETWORK_KINDS)
+        return replace(self, settings=replace(self.settings, device=str(device)))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.models.mdm.files import folder_of
+
+        return super().reads() | {"model": folder_of(self.settings.model)}
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.models.mdm.files import digest
+
+        return super().inputs() | {"model": digest(self.settings.model)}
+
+    def key_settings(self) -> dict[str, Any]:
+        return {name: value for name, value in super().key_settings().items() if name != "processes"}
+
+    def prepare(self, inputs: dict[str, str]) -> PlannedAdaptation:
+        from mudg.stages.adapt import PlannedAdaptation
+
+        return PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted))
+
+    def make(self, work: RunDir, prepared: PlannedAdaptation) -> dict[str, Any]:
+        folder = work.path / "work"
+        prepared.make_clips(fit_scene, folder)
+        adapted = Learn(out=folder / "learn", settings=prepared.training(folder)).run()
+        summary = prepared.write_model(adapted, folder, work.path)
+        shutil.rmtree(folder, ignore_errors=True)
+        return summary
+
+    def resulting(self, folder: Path) -> Path:
+        return folder / "model"
+
+
+def fit_scene(settings: FitConfig, scene: Path, fused: Path | None, out: Path) -> None:
+    """Fuse a scene, unless it has clouds, and fit it."""
+    from mudg.stages.config import FuseConfig
+
+    fused = fused or Fuse(scene=scene, out=out / "fuse", settings=FuseConfig()).run()
+    Fit(scene=scene, fused=fused, out=out / "fit", settings=settings).run()

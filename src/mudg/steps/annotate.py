@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
+from mudg.base.layout import SCENE_FILES
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
     from mudg.stages.config import AnnotateConfig
 
 
@@ -19,15 +22,34 @@ class Annotate(Listed):
     examples = ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled")
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "scene"
+    version, files = 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", "labelled/")
     short = ("labeller", "weights", "depth_network", "device", "sweeps", "ego", "processes")
     scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
     """Scene directory written by ingest, or folder of mudg run."""
     settings: AnnotateConfig
 
-    def run(self) -> Any:
+    def settings_in_list(self) -> AnnotateConfig:
+        return replace(self.settings, processes=1)
+
+    def checked(self) -> Self:
+        from mudg.stages.labelling import depth
+
+        return replace(self, settings=depth.placed(self.settings))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.stages.labelling import depth
+
+        return super().reads() | depth.folders(self.settings)
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.stages.labelling import depth
+
+        return super().inputs() | depth.digests(self.settings)
+
+    def key_settings(self) -> dict[str, Any]:
+        return {name: value for name, value in super().key_settings().items() if name != "processes"}  # it changes no result
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
         from mudg.stages import annotate
 
-        self.refuse_wrong_list(self.scene)
-        if self.scene is None:
-            return self.run_list(annotate.run_many)
-        return annotate.run(self.settings, self.scene, self.out, overwrite=self.overwrite)
+        return annotate.write_labelled(self.settings, cast("Path", self.scene), work)

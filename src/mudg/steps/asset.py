@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from mudg.steps.step import RUN, Flag, Step
+from mudg.base.errors import UsageError
+from mudg.base.layout import MODEL_FILES
+from mudg.steps.engine import Result
+from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.result_file import ResultFile
+    from mudg.base.run_folder import RunDir, VerbOutput
     from mudg.stages.config import ImportConfig
+    from mudg.stages.editing.runs import RunParts
 
 
-class AssetExport(Step):
+class AssetExport(Result):
     """Write one object of a fitted scene to a file that edit scripts can insert."""
 
     section = "change a drive"
@@ -32,13 +39,41 @@ class AssetExport(Step):
     def verb(cls) -> str:
         return "asset export"
 
-    def run(self) -> Any:
+    @property
+    def is_file(self) -> bool:
+        return True
+
+    def run_parts(self) -> RunParts:
+        """The fits and the scene of the source."""
+        from mudg.stages.editing.runs import find_run
+
+        parts = find_run(self.source)
+        return replace(parts, scene=self.scene or parts.scene)
+
+    def checked(self) -> Self:
+        refuse_other_name(self.out)
+        return self
+
+    def inputs(self) -> dict[str, str]:
+        parts = self.run_parts()
+        return self.digests({"fit": parts.model, "scene": parts.scene})
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"id": self.track_id}
+
+    def make(self, work: ResultFile, prepared: Any) -> dict[str, Any]:
         from mudg.stages.editing import assets
 
-        return assets.run_export(self.source, self.track_id, self.out, self.scene, self.overwrite)
+        return assets.write_asset_from(self.run_parts(), self.track_id, work.path)
 
 
-class AssetImport(Step):
+def refuse_other_name(out: Path) -> None:
+    """UsageError for a file with another suffix than assets have."""
+    if out.suffix != ".safetensors":
+        raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
+
+
+class AssetImport(Result):
     """Make an object, or a scene, of a file of Gaussians from another program."""
 
     section = "change a drive"
@@ -56,7 +91,35 @@ class AssetImport(Step):
     def verb(cls) -> str:
         return "asset import"
 
-    def run(self) -> Any:
+    @property
+    def is_file(self) -> bool:
+        return self.settings.kind != "scene"
+
+    def output(self) -> VerbOutput:
+        from mudg.base.run_folder import VerbOutput
+
+        return VerbOutput("asset", 1, MODEL_FILES)
+
+    def checked(self) -> Self:
         from mudg.stages.exporting import imports
 
-        return imports.run(self.settings, self.file, self.out, overwrite=self.overwrite)
+        imports.refuse_other_settings(self.settings)
+        if self.is_file:
+            refuse_other_name(self.out)
+            imports.bounded(self.file)
+        return self
+
+    def key_settings(self) -> dict[str, Any]:
+        return super().key_settings() | ({"name": self.file.name} if self.is_file else {})
+
+    def prepare(self, inputs: dict[str, str]) -> Any:
+        from mudg.stages.exporting import imports
+
+        return None if self.is_file else imports.read_file(self.file, self.settings)
+
+    def make(self, work: ResultFile | RunDir, prepared: Any) -> dict[str, Any]:
+        from mudg.stages.exporting import imports
+
+        if self.is_file:
+            return imports.write_object(self.settings, self.file, work.path)
+        return imports.write_scene(self.settings, prepared, self.file, work.path)

@@ -57,7 +57,7 @@ class BatchRun(Step):
         """The settings of the batch itself; a file holds those of its steps."""
         return super().settings_from(inputs, None, given)
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages import batch
 
         settings = batch.settings_of(self.preset, self.config, self.set)
@@ -85,7 +85,7 @@ class BatchProgress(Step):
     def verb(cls) -> str:
         return "batch status"
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages import batch
 
         return batch.show_status(self.out, self.html, self.price, self.watch_s)
@@ -105,7 +105,7 @@ class BatchRetry(Step):
     def verb(cls) -> str:
         return "batch retry"
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages import batch
 
         return batch.retry(self.out, self.reason)

@@ -34,7 +34,7 @@ class Convert(Step):
     Files that do not belong to the model are kept."""
     settings: ConvertConfig
 
-    def run(self) -> Path:
+    def act(self) -> Path:
         from mudg.stages import convert
 
         return convert.run(self.settings, self.checkpoint, self.to, overwrite=self.overwrite)

@@ -16,7 +16,7 @@ class Doctor(Step):
     scene: Annotated[Path | None, Flag("[SCENE]", "first")] = None
     """Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this machine)."""
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages import doctor
 
         return doctor.report_scene(self.scene) if self.scene is not None else doctor.report_machine()

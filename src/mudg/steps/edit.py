@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+from mudg.base.layout import MODEL_FILES, SCENE_FILES, below
+from mudg.steps.engine import script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
     from mudg.stages.config import EditConfig
+    from mudg.stages.edit import PlannedEdit
+    from mudg.stages.editing.runs import RunParts
+
+_MODELS = (*MODEL_FILES, *below("fit/*", MODEL_FILES))
+_CLOUDS = ("static.safetensors", "objects/*.safetensors", "fuse.json")
 
 
 class Edit(Output):
@@ -21,6 +30,8 @@ class Edit(Output):
         "mudg edit runs/mudg_s edits.yaml --scene scenes/city --fused runs/fused --out runs/edited",
     )
     result = "edited"
+    version = 3
+    files = ("edits.yaml", "edit.json", "lidar.json", *_MODELS, *below("scene", (*SCENE_FILES, "manifest.json")), *below("fuse", _CLOUDS))
     short = ("device", "harmonize.on", "harmonize.model", "harmonize.steps")
     source: Annotated[Path, RUN]
     """Gaussian scene written by fit, or folder of a finished mudg run."""
@@ -33,7 +44,35 @@ class Edit(Output):
     """Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its own."""
     settings: EditConfig
 
-    def run(self) -> Path:
-        from mudg.stages import edit
+    def run_parts(self) -> RunParts:
+        """The fits, scene and clouds that are edited."""
+        from mudg.stages.editing.runs import find_run
 
-        return edit.run(self.settings, self.source, self.script, self.out, scene=self.scene, fused=self.fused, overwrite=self.overwrite)
+        parts = find_run(self.source)
+        return replace(parts, scene=self.scene or parts.scene, fused=self.fused or parts.fused)
+
+    def reads(self) -> dict[str, Path | str | None]:
+        parts = self.run_parts()
+        return super().reads() | {"scene": parts.scene, "fused": parts.fused}
+
+    def inputs(self) -> dict[str, str]:
+        parts = self.run_parts()
+        fits = {f"fit {name}".strip(): path for name, path in parts.fits.items()}
+        return {"edits": script_of(self.script)[1]} | self.digests({**fits, "scene": parts.scene, "fused": parts.fused})
+
+    def places(self) -> dict[str, Path | None]:
+        parts = self.run_parts()
+        return {} if parts.whole else {"scene": parts.scene, "fused": parts.fused}
+
+    def prepare(self, inputs: dict[str, str]) -> PlannedEdit:
+        from mudg.core.raster.place import drawing_device
+        from mudg.stages.edit import PlannedEdit
+
+        drawing_device(self.settings.device, "render", self.settings.raster)
+        planned = PlannedEdit.of(self.settings, script_of(self.script)[0], self.run_parts())
+        if planned.parts.whole and planned.drive.plan.weather_of_beams is not None:
+            inputs["weather of beams"] = "fog, rain"  # another result than before sweeps showed them
+        return planned
+
+    def make(self, work: RunDir, prepared: PlannedEdit) -> dict[str, Any]:
+        return prepared.write(self.settings, work)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from mudg.steps.step import FILE_YAML, RUN, Flag, Step
+from mudg.steps.engine import Result, script_of
+from mudg.steps.step import FILE_YAML, RUN, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.result_file import ResultFile
+    from mudg.base.run_folder import RunDir, VerbOutput
     from mudg.stages.config import ExportConfig
+    from mudg.stages.editing.runs import RunParts
+    from mudg.stages.exporting.export import Exported
 
 
-class Export(Step):
+class Export(Result):
     """Write a fitted scene for other programs: PLY, SPZ, glTF, USD, SOG; cameras for nerfstudio and COLMAP."""
 
     section = "other programs"
@@ -37,7 +42,55 @@ class Export(Step):
     """Replace the output if it exists."""
     settings: ExportConfig
 
-    def run(self) -> Path:
+    def act(self) -> Path:
+        from mudg.base.processes import one_torch_thread
+
+        with one_torch_thread():
+            return super().act()
+
+    def output(self) -> VerbOutput:
+        from mudg.base.run_folder import VerbOutput
+        from mudg.stages.exporting.export import FOLDERS
+
+        return VerbOutput("export", *FOLDERS[self.format])
+
+    @property
+    def is_file(self) -> bool:
+        from mudg.stages.exporting.export import FOLDERS
+
+        return self.format not in FOLDERS
+
+    def run_parts(self) -> RunParts:
+        """The fits, scene and clouds that are exported."""
+        from mudg.stages.exporting.export import parts_of
+
+        return parts_of(self.format, self.source, self.scene)
+
+    def checked(self) -> Self:
         from mudg.stages.exporting import export
 
-        return export.run(self.settings, self.format, self.source, self.out, scene=self.scene, edits=self.edits, overwrite=self.overwrite)
+        export.check(self.settings, self.format, self.out)
+        return self
+
+    def reads(self) -> dict[str, Path | str | None]:
+        return super().reads() | {"scene": self.run_parts().scene}
+
+    def inputs(self) -> dict[str, str]:
+        parts = self.run_parts()
+        fit = {f"fit {name}".strip(): path for name, path in parts.fits.items() if path == parts.model}
+        return self.digests({**fit, "scene": parts.scene, "fused": parts.fused, "edits": self.edits})
+
+    def key_settings(self) -> dict[str, Any]:
+        return super().key_settings() | {"format": self.format}
+
+    def prepare(self, inputs: dict[str, str]) -> Exported:
+        from mudg.stages.exporting.export import Exported
+
+        return Exported.of(self.run_parts(), None if self.edits is None else script_of(self.edits)[0])
+
+    def make(self, work: ResultFile | RunDir, prepared: Exported) -> dict[str, Any]:
+        from mudg.stages.exporting import export
+
+        if self.is_file:
+            return export.write_file(self.settings, self.format, prepared, work.path)
+        return export.write_folder(self.format, prepared, work.path)

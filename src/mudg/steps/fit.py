@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
+from mudg.base.errors import UsageError
+from mudg.base.layout import MODEL_FILES
+from mudg.steps.engine import paths_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir, VerbOutput
     from mudg.stages.config import FitConfig
+    from mudg.stages.fit import FitInputs
 
 
 class Fit(Output):
@@ -23,12 +29,13 @@ class Fit(Output):
     )
     smaller = "smaller images (mudg ingest --resolution), fewer Gaussians (--start.gaussians, --densify.max-gaussians)"
     result = "model"
+    version, files = 3, (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/")
     short = ("method", "iterations", "cameras", "width_px", "sh_degree", "seed", "device", "densify.max_gaussians")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
     """Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag."""
-    observations: Annotated[tuple[Path, ...], Flag("FOLDER ...")] = ()
+    observations: Annotated[tuple[Path, ...], Flag("FOLDER ...", "", "views")] = ()
     """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, Flag("FOLDER", "", "start_from")] = None
     """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views are used
@@ -36,14 +43,71 @@ class Fit(Output):
     settings: FitConfig
 
     def required(self) -> tuple[str, ...]:
-        alone = self.settings.method == "emernerf" or (self.scene / "scene.json").exists()
+        alone = self.reads_scene_alone or (self.scene / "scene.json").exists()
         return () if alone else ("fused",)
 
-    def run(self) -> Path:
-        from mudg.stages import fit
-        from mudg.stages.editing.runs import views_at
+    @property
+    def reads_scene_alone(self) -> bool:
+        """Whether the method has no Gaussians: it starts from no clouds."""
+        from mudg.methods import METHODS
 
-        return fit.run(
-            self.settings, self.scene, self.fused, self.out,
-            observations=tuple(map(views_at, self.observations)), start=self.start_from, overwrite=self.overwrite,
-        )  # fmt: skip
+        return METHODS[self.settings.method].scene == "radiance"
+
+    def output(self) -> VerbOutput:
+        """Methods without boxes fuse the clouds again; results of those that took the ones of `mudg fuse` are made again."""
+        from mudg.methods import METHODS
+
+        own = super().output()
+        return own if self.reads_scene_alone or METHODS[self.settings.method].boxes else replace(own, version=own.version + 1)
+
+    def checked(self) -> Self:
+        if self.reads_scene_alone:
+            if self.start_from is not None:
+                raise UsageError(f"{self.settings.method} cannot go on with a finished fit", remedy="leave --start-from out")
+            return self
+        from mudg.stages import fit
+
+        given = (self.fused is not None, bool(self.observations), self.start_from is not None)
+        fit.check(self.settings, fused=given[0], virtual=given[1], continued=given[2])
+        return self
+
+    def reads(self) -> dict[str, Path | str | None]:
+        if self.reads_scene_alone:
+            return {"scene": self.scene}
+        return super().reads() | {"virtual.lpips-weights": self.settings.virtual.lpips_weights}
+
+    def inputs(self) -> dict[str, str]:
+        return self.digests({"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused})
+
+    def places(self) -> dict[str, Path | None]:
+        return {"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused}
+
+    def prepare(self, inputs: dict[str, str]) -> FitInputs | None:
+        if self.reads_scene_alone:
+            from mudg.base.devices import choose_device
+
+            choose_device(self.settings.device, "fit")
+            return None
+        from mudg.stages import fit
+        from mudg.stages.fitting.continued import StartFit
+        from mudg.stages.fitting.views import virtual_sets
+
+        virtual, begun = {}, None if self.start_from is None else StartFit.of_folder(self.start_from, inputs)
+        inputs |= {} if begun is None else {"start": begun.digest}
+        if fit.learns_virtual(self.settings.method):
+            virtual = virtual_sets(self.observations)
+            inputs |= self.digests({name: path for name, path in paths_of(self).items() if name.startswith("observations")})
+        inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
+        fit.check_device(self.settings)
+        return fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
+
+    def make(self, work: RunDir, prepared: FitInputs | None) -> dict[str, Any]:
+        if prepared is None:
+            from mudg.base.devices import choose_device
+            from mudg.data.scene import read_scene
+            from mudg.stages.radiance.loop import fit_radiance
+
+            return fit_radiance(self.settings, read_scene(self.scene), work, choose_device(self.settings.device, "fit"))
+        from mudg.stages import fit
+
+        return fit.write_fit(self.settings, prepared, work)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
+    from mudg.base.types import Scene
     from mudg.stages.config import FuseConfig
 
 
@@ -19,14 +21,20 @@ class Fuse(Listed):
     examples = ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2")
     smaller = "larger voxels (--voxel-m), or a shorter log (mudg ingest --frames)"
     result = "fused"
+    version, files = 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png")
     scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     settings: FuseConfig
 
-    def run(self) -> Any:
+    def prepare(self, inputs: dict[str, str]) -> Scene:
+        from mudg.data.scene import read_scene
         from mudg.stages import fuse
 
-        self.refuse_wrong_list(self.scene)
-        if self.scene is None:
-            return self.run_list(fuse.run_many)
-        return fuse.run(self.settings, self.scene, self.out, overwrite=self.overwrite)
+        scene = read_scene(cast("Path", self.scene))
+        fuse.refuse_without_lidar(scene)
+        return scene
+
+    def make(self, work: RunDir, prepared: Scene) -> dict[str, Any]:
+        from mudg.stages import fuse
+
+        return fuse.write_fusion(prepared, self.settings, work.path)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import UsageError
+from mudg.base.layout import SCENE_FILES
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag, usage
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
     from mudg.stages.config import IngestConfig
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
@@ -29,6 +33,7 @@ class Ingest(Listed):
     )  # fmt: skip
     smaller = "smaller images (--resolution; of a city --city.width), fewer --frames, one image at a time (--workers 1)"
     result = "scene"
+    version, files = 1, (*SCENE_FILES, "contact_sheet.jpg")
     short = ("resolution", "frames", "cameras", "sequence", "test_every", "city.seed", "city.n_frames", "city.width", "city.height")
     parts = {"city": "Generate a city: a scene with exact truth."} | {
         name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
@@ -37,6 +42,7 @@ class Ingest(Listed):
     """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not recognised. OUT: the
     folder to write, in place of --out."""
     settings: IngestConfig
+    of_a_line = ("format", "frames", "cameras", "sequence", "poses", "boxes", "seed")
 
     @classmethod
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -60,10 +66,34 @@ class Ingest(Listed):
     def applies(cls, part: str, name: str, text: str) -> bool:
         return name not in OF_A_LOG if part == "city" else not name.startswith("city.") and name != "format"
 
-    def run(self) -> Any:
+    @functools.cached_property
+    def kind(self) -> str:
+        """What the log is: a format, ``city`` or ``scene``."""
         from mudg.stages import ingest
 
-        self.refuse_wrong_list(self.log)
-        if self.list is not None:
-            return self.run_list(ingest.run_many)
-        return ingest.run(self.settings, self.log, self.out, overwrite=self.overwrite)
+        return ingest.kind_of(self.settings, Path(self.log))
+
+    def checked(self) -> Self:
+        from mudg.stages import ingest
+
+        return replace(self, overwrite=self.overwrite or ingest.is_abandoned(self.out))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.stages import ingest
+
+        named = {"log": "" if self.log == "city" else self.log, "poses": self.settings.poses, "boxes": self.settings.boxes}
+        return named | ingest.files_read(self.settings, Path(self.log), self.kind)
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.stages import ingest
+
+        return {} if self.kind == "city" else {"source": ingest.source_digest(Path(self.log), self.kind, self.settings)}
+
+    def key_settings(self) -> dict[str, Any]:
+        idle = ("workers",) if self.kind == "city" else ("workers", "city")  # what the result does not depend on
+        return {name: value for name, value in super().key_settings().items() if name not in idle}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        from mudg.stages import ingest
+
+        return ingest.write_scene(self.settings, Path(self.log), self.kind, work)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
+from mudg.steps.engine import opened
 from mudg.steps.outputs import Output
 
 if TYPE_CHECKING:
@@ -22,13 +24,38 @@ class Learn(Output):
     )  # fmt: skip
     smaller = "smaller clips (--data.width, --data.height), a smaller batch, fewer --compute.workers"
     result = "model"
+    version = 1
+    files = ("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png", "tensorboard/", "loss.png",
+             "metrics.json", "model/*", "model.part/")  # fmt: skip
     short = (
         "start", "steps", "seed", "precision", "data.scenes", "data.clips", "data.cities", "data.width", "data.height",
         "data.window", "optimizer.lr", "optimizer.batch_frames", "compute.device", "compute.workers",
     )  # fmt: skip
     settings: LearnConfig
 
-    def run(self) -> Path:
+    def act(self) -> Path:
         from mudg.stages import learn
 
-        return learn.run(self.settings, self.out, overwrite=self.overwrite)
+        step = self.checked()
+        learn.train(step.settings, step.out, step.output(), lambda: opened(step)[1])
+        return self.out / "model"
+
+    def checked(self) -> Self:
+        from mudg.stages import learn
+
+        return replace(self, settings=learn.check(self.settings))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.stages import learn
+
+        return learn.files_read(self.settings, self.out, self.overwrite)
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.stages import learn
+
+        return learn.inputs_of(self.settings)
+
+    def key_settings(self) -> dict[str, Any]:
+        from mudg.base.config import to_dict
+
+        return {name: value for name, value in to_dict(self.settings).items() if name != "compute"}

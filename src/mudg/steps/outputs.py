@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from mudg.base.errors import UsageError
-from mudg.steps.step import Flag, Step
+from mudg.steps.engine import Result
+from mudg.steps.step import Flag, positions
 
 
-class Output(Step):
+class Output(Result):
     """A step that writes a folder."""
 
     out: Annotated[Path, Flag()]
@@ -32,15 +33,26 @@ class Listed(Output):
     jobs: int = 0
     """With --list: number of scenes processed at the same time (0 = one per processor)."""
 
-    def refuse_wrong_list(self, source: object) -> None:
-        """UsageError unless there is either a source or a list, and --shard and --jobs only with a list."""
+    of_a_line: ClassVar[tuple[str, ...]] = ()
+    """Settings that a line of the list may give."""
+
+    def act(self) -> Any:
+        source = getattr(self, positions(type(self))[0])
         if self.list is None and (self.shard or self.jobs):
             raise UsageError("--shard and --jobs need --list", remedy="leave them out, or give --list FILE")
         if self.list is None and not source:
             raise UsageError(f"no {self.verb()} input was given", expected=f"{self.examples[0]}, or --list FILE")
         if self.list is not None and source:
             raise UsageError("give a source or a list, not both", got=f"{source} and --list {self.list}")
+        if self.list is None:
+            return super().act()
+        from mudg.stages.batches.listed import ListedRun, run_listed
+        from mudg.stages.batches.plan import read_list
 
-    def run_list(self, run_many: Any) -> dict[str, Any]:
-        """Call a stage's function for lists."""
-        return run_many(self.settings, self.list, self.out, self.shard, self.jobs, self.overwrite)  # type: ignore[attr-defined]
+        entries = read_list(self.list, self.of_a_line)
+        settings = self.settings_in_list()
+        return run_listed(ListedRun(self.verb(), settings, entries, self.out, self.jobs, self.overwrite, self.shard, self.list))
+
+    def settings_in_list(self) -> Any:
+        """Settings of the steps over a list, several of which run at a time."""
+        return self.settings

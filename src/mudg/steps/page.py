@@ -32,7 +32,7 @@ class Page(Step):
     """Replace the page if it exists."""
     settings: PageConfig
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages.viewing import view
 
         return view.run_page(self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
+from mudg.base.errors import UsageError
+from mudg.base.layout import OBSERVATION_FILES, below
+from mudg.steps.engine import script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
     from mudg.stages.config import RenderConfig
 
 
@@ -22,6 +26,7 @@ class RenderViews(Output):
     )
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
+    version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES))
     short = ("cameras", "shifts_m", "paths", "width_px", "video", "fps", "remove_tracks", "device", "harmonize.on", "harmonize.model")
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
@@ -40,9 +45,27 @@ class RenderViews(Output):
     def required(self) -> tuple[str, ...]:
         return ("model",)
 
-    def run(self) -> Path:
+    def checked(self) -> Self:
+        if self.settings.harmonize.on and (self.edits is None or self.fused is None):
+            raise UsageError("harmonising repairs what an edit script touched, from the fused clouds", where="--harmonize.on",
+                got=f"no --{'edits' if self.edits is None else 'fused'}", remedy="give --edits and --fused, or leave it out")  # fmt: skip
+        return self
+
+    def inputs(self) -> dict[str, str]:
+        read = self.digests({"scene": self.scene, "model": self.model, "edits": self.edits})
+        if not self.settings.harmonize.on:
+            return read
+        from mudg.models.mdm.files import digest
+
+        return read | self.digests({"fused": self.fused}) | {"diffusion": digest(self.settings.harmonize.model)}
+
+    def prepare(self, inputs: dict[str, str]) -> Any:
         from mudg.stages import render
 
-        return render.run(
-            self.settings, self.scene, cast("Path", self.model), self.out, edits=self.edits, fused=self.fused, overwrite=self.overwrite
-        )
+        script = None if self.edits is None else script_of(self.edits)[0]
+        return render.prepare(self.settings, self.scene, cast("Path", self.model), script, self.fused)
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        from mudg.stages import render
+
+        return render.write_views(self.settings, self.scene, cast("Path", self.model), prepared, work.path)

@@ -21,7 +21,7 @@ class Report(Step):
     overwrite: bool = False
     """Replace the page if it exists."""
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages.viewing import gallery
 
         return gallery.run(self.runs, self.out, overwrite=self.overwrite)

@@ -46,10 +46,10 @@ class Run(Output):
         made = c.with_lines(made, cameras=inputs.get("cameras") or None, shifts_m=inputs["shifts_m"] or None)
         return configuration.load(c.RunConfig, made, None, given)
 
-    def run(self) -> dict[str, Any]:
-        from mudg.stages import run
+    def act(self) -> dict[str, Any]:
+        from mudg.steps import pipeline
 
-        return run.run_chain(self.settings, self.source, self.out, overwrite=self.overwrite)
+        return pipeline.run_chain(self.settings, self.source, self.out, overwrite=self.overwrite)
 
 
 class Demo(Output):
@@ -77,7 +77,7 @@ class Demo(Output):
         """As for mudg run."""
         return Run.settings_from(inputs, file, given)
 
-    def run(self) -> dict[str, Any]:
-        from mudg.stages import run
+    def act(self) -> dict[str, Any]:
+        from mudg.steps import pipeline
 
-        return run.run_chain(self.settings, "city", self.out, overwrite=self.overwrite)
+        return pipeline.run_chain(self.settings, "city", self.out, overwrite=self.overwrite)

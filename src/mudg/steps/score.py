@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import UsageError
+from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.steps.outputs import Output
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
     from mudg.stages.config import ScoreConfig
+
+_FILES = ("lpips_weights", "lpips_vgg_weights", "lpips_squeeze_weights", "fid_weights", "fvd_weights", "dino_weights", "clip_weights",
+          "video_features", "detections", "lanes")  # fmt: skip
+"""Settings that name files and folders to read."""
 
 
 class Score(Output):
@@ -20,6 +26,8 @@ class Score(Output):
     section = "single steps, in the order of use"
     examples = ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",)
     smaller = "smaller views (--width-px), fewer --views"
+    version, files = 6, ("metrics.json", "metrics.md", "errors/*.png", "features/*.safetensors",
+                         *below("truth/*", OBSERVATION_FILES), *below("nearest_fill/*", OBSERVATION_FILES))  # fmt: skip
     short = ("baseline", "lpips_weights", "fid_weights", "fvd_weights", "perceptual_views", "device")
     scene: Annotated[Path, SCENE]
     """Scene directory that the views belong to, or folder of mudg run."""
@@ -30,14 +38,56 @@ class Score(Output):
     """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     settings: ScoreConfig
 
-    def run(self) -> Path:
-        from mudg.stages import score
+    truth: Annotated[Path | None, Flag(hidden=True)] = None
+    """Folder of `DrawTruth` for the scene, read instead of drawing the truth again."""
 
+    def checked(self) -> Self:
         if not self.views:
             raise UsageError("no views were given", where="--views", expected="NAME=FOLDER ...")
-        return score.run(self.settings, self.scene, self.views, self.out, fused=self.fused, overwrite=self.overwrite)
+        return self
+
+    def reads(self) -> dict[str, Path | str | None]:
+        return super().reads() | {name.replace("_", "-"): getattr(self.settings, name) for name in _FILES}
+
+    def inputs(self) -> dict[str, str]:
+        files = {name: getattr(self.settings, name) for name in _FILES}
+        fused = self.fused if self.settings.baseline else None
+        return self.digests({"scene": self.scene, **self.views, "fused": fused, **files, "truth": self.truth})
+
+    def prepare(self, inputs: dict[str, str]) -> Any:
+        from mudg.base.devices import choose_device
+
+        choose_device(self.settings.device, "networks of the scores")
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        from mudg.stages import score
+
+        return score.write_scores(self.settings, self.scene, self.views, work.path, fused=self.fused, truth=self.truth)
 
     def answer(self, outcome: Any) -> dict[str, Any]:
         from mudg.stages import score
 
         return {"metrics": outcome / "metrics.json", "text": score.summary_table(outcome)}
+
+
+class DrawTruth(Output):
+    """Draw the truth of a generated city on some trajectories once, for many scores."""
+
+    version, files = 2, below("*", (*OBSERVATION_FILES, "moving.safetensors"))
+    scene: Path
+    trajectories: tuple[Any, ...]
+    """Each a `Trajectory`."""
+
+    @classmethod
+    def verb(cls) -> str:
+        return "truth"
+
+    def key_settings(self) -> dict[str, Any]:
+        views = [[v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width] for path in self.trajectories for v in path.views]
+        return {"trajectories": [path.name for path in self.trajectories], "views": views}
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        from mudg.stages import score_truth
+
+        score_truth.write_truth(self.scene, self.trajectories, work.path)
+        return {"trajectories": [path.name for path in self.trajectories]}

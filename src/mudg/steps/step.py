@@ -26,16 +26,18 @@ class Flag:
     """What the command line knows of a field beyond its name, type, default and text.
 
     Args:
-        metavar: what stands for the value in the help.
+        metavar: what stands for the value in the help. FILE.yaml: an edit script.
         position: "first": a word without a flag. "second": its word may also follow the first one without the flag. "rest": all further
             words.
         part: the part of a run that the field reads ("scene", "fused", "model", "fitted", "start_from", "views"): the folder of a run
             is taken for it.
+        hidden: only other steps set it; the command line and the function do not have it.
     """
 
     metavar: str = "FOLDER"
     position: Literal["", "first", "second", "rest"] = ""
     part: str = ""
+    hidden: bool = False
 
 
 SCENE = Flag("SCENE", "first", "scene")
@@ -68,7 +70,25 @@ class Step:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def run(self) -> Any:
-        """Do it. Returns the path of the result, or what the command shows by name."""
+        """Do it. Returns the path of the result, or what the command shows by name. Where it takes a part of a run, the folder of a run
+        will do."""
+        names = [field.name for field in fields(self) if flag_of(type(self), field.name).part]
+        return (self.with_parts(names) if names else self).act()
+
+    def with_parts(self, names: Sequence[str]) -> Self:
+        """This step with the parts of runs that these fields mean."""
+        from mudg.stages.editing import runs
+
+        given = {name: getattr(self, name) for name in names}
+        found = runs.parts_of({name: path for name, path in given.items() if flag_of(type(self), name).part != "views"}, self.required())
+        for name in given.keys() - found.keys():
+            views = given[name]
+            named = isinstance(views, Mapping)
+            found[name] = {key: runs.views_at(path, key) for key, path in views.items()} if named else tuple(map(runs.views_at, views))
+        return replace(self, **found)
+
+    def act(self) -> Any:
+        """What `run` does when all parts of runs are found."""
         raise NotImplementedError
 
     def answer(self, outcome: Any) -> dict[str, Any]:
@@ -163,19 +183,6 @@ class Step:
         return (cls.__doc__ or "").strip().splitlines()[0]
 
 
-def perform(step: Step) -> Any:
-    """Run a step; where it takes a part of a run, the folder of a run will do."""
-    parts = [field.name for field in fields(step) if flag_of(type(step), field.name).part]
-    if parts:
-        from mudg.stages.editing import runs
-
-        found = runs.parts_of({name: getattr(step, name) for name in parts if name != "views"}, step.required())
-        if "views" in parts:
-            found["views"] = {name: runs.views_at(path, name) for name, path in step.views.items()}  # type: ignore[attr-defined]
-        step = replace(step, **found)  # type: ignore[type-var]
-    return step.run()
-
-
 # what a declaration says -----------------------------------------------------------------------------------------------
 
 
@@ -256,7 +263,7 @@ def usage(cls: type[Step]) -> str:
 
 def in_reading_order(cls: type[Any]) -> list[dataclasses.Field[Any]]:
     """Fields but the settings: words without a flag, what has to be given, then the rest."""
-    own = [field for field in fields(cls) if field.name != "settings"]
+    own = [field for field in fields(cls) if field.name != "settings" and not flag_of(cls, field.name).hidden]
 
     def rank(field: dataclasses.Field[Any]) -> int:
         if flag_of(cls, field.name).position in ("first", "rest"):
@@ -368,14 +375,14 @@ def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
         twice = sorted(values.keys() & given.keys())
         if twice:
             raise UsageError(f"mudg.{name} was given {twice[0]} twice")
-        own = {field.name for field in fields(cls) if field.name != "settings"}
+        own = {field.name for field in in_reading_order(cls)}
         values |= {key: value for key, value in given.items() if key in own}
         settings = {key: _plain(value) for key, value in given.items() if key not in own}
         if settings and cls.settings_type() is None:
             near = nearest(next(iter(settings)), own, 0.5)
             raise UsageError(f"mudg.{name} has no argument {next(iter(settings))!r}", expected=", ".join(sorted(own)),
                 remedy=f"did you mean {near}?" if near else "")  # fmt: skip
-        outcome = perform(cls.build(values, settings, None if config is None else Path(config)))
+        outcome = cls.build(values, settings, None if config is None else Path(config)).run()
         return outcome[cls.result] if isinstance(outcome, dict) and cls.result in outcome else outcome
 
     call.__name__ = call.__qualname__ = name
@@ -403,7 +410,7 @@ def signature(cls: type[Step]) -> inspect.Signature:
     kinds = inspect.Parameter
     first, later = [], []
     for field in fields(cls):
-        if field.name == "settings":
+        if field.name == "settings" or flag_of(cls, field.name).hidden:
             continue
         at = kinds.POSITIONAL_OR_KEYWORD if flag_of(cls, field.name).position else kinds.KEYWORD_ONLY
         default = kinds.empty if field.default is MISSING else field.default

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
+from mudg.base.layout import OBSERVATION_FILES, below
+from mudg.steps.engine import script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import RunDir
     from mudg.stages.config import SynthesizeConfig
 
 
@@ -19,6 +23,7 @@ class Synthesize(Output):
     examples = ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",)
     smaller = "one process (--processes 1), smaller views (--width-px), fewer --cameras and --shifts-m"
     result = "views"
+    version, files = 2, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
     short = (
         "model",
         "cameras",
@@ -47,10 +52,37 @@ class Synthesize(Output):
     def required(self) -> tuple[str, ...]:
         return ("fused",)
 
-    def run(self) -> Path:
+    def checked(self) -> Self:
+        from mudg.stages import synthesize
+        from mudg.stages.learning import loading
+
+        renders = self.fitted is not None
+        weather = self.edits is not None and synthesize.shows_weather(self.settings, script_of(self.edits)[0], renders)
+        return replace(self, settings=loading.check_config(self.settings, renders, weather=weather))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.models.mdm.files import folder_of
+
+        return super().reads() | {"model": folder_of(self.settings.model)}
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.models.mdm.files import digest
+
+        first = self.digests({"scene": self.scene, "fused": self.fused})
+        return first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
+
+    def key_settings(self) -> dict[str, Any]:
+        """Without those that say how is computed, not what: a result may be resumed and reused under others."""
+        return {name: value for name, value in super().key_settings().items() if name not in ("offload", "compiled")}
+
+    def prepare(self, inputs: dict[str, str]) -> Any:
         from mudg.stages import synthesize
 
-        return synthesize.run(
-            self.settings, self.scene, cast("Path", self.fused), self.out,
-            fitted=self.fitted, edits=self.edits, overwrite=self.overwrite,
-        )  # fmt: skip
+        script = None if self.edits is None else script_of(self.edits)[0]
+        given = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script)
+        return given, synthesize.read_drive(self.settings, given)
+
+    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+        from mudg.stages import synthesize
+
+        return synthesize.write_views(self.settings, *prepared, work.path)

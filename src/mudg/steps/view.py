@@ -34,7 +34,7 @@ class ViewScene(Step):
     def verb(cls) -> str:
         return "view"
 
-    def run(self) -> dict[str, Any]:
+    def act(self) -> dict[str, Any]:
         from mudg.stages.viewing import edits, view
 
         files = edits.EditFiles(self.edits, self.edits_out, self.overwrite)

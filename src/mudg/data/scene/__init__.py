@@ -18,10 +18,9 @@ from mudg.data.scene.check import Finding, check_scene
 from mudg.data.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.data.scene.point_classes import ImagePointClasses, image_point_classes
 from mudg.data.scene.read import decode_image, read_image, read_points, read_scene
-from mudg.data.scene.write import SCENE_FILES, SceneWriter, write_zip
+from mudg.data.scene.write import SceneWriter, write_zip
 
 __all__ = [
-    "SCENE_FILES",
     "Finding",
     "ImagePointClasses",
     "SceneWriter",

@@ -31,8 +31,6 @@ from mudg.data.scene.labels import encode_label, encode_png, encode_safetensors,
 from mudg.data.scene.read import all_refs, check_image, checked_points, is_grey, read_points, read_scene
 
 _MAX_PENDING_WRITES: Final = 8
-SCENE_FILES: Final = ("scene.json", "tracks.json", "images/*/*", "lidar/*/*.safetensors", "labels/*/*/*")
-"""Patterns of the names in a scene directory."""
 
 
 class SceneWriter:

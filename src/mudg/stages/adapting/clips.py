@@ -27,7 +27,7 @@ from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages.adapting.lessons import TRUSTED_LABELS, LearntLog, Lesson, fit_lesson, lessons_of
+from mudg.stages.adapting.lessons import TRUSTED_LABELS, FitScene, LearntLog, Lesson, fit_lesson, lessons_of
 from mudg.stages.config import AdaptConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model
@@ -65,14 +65,14 @@ def why_too_short(plan: Plan, config: AdaptConfig) -> str:
     return f"it is too short: {len(plan)} clips of {config.block} frames, {scored} of them to score"
 
 
-def make_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, rows: Plan, work: Path) -> int:
+def make_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, rows: Plan, work: Path, fit_scene: FitScene) -> int:
     """Fit a lesson and write its shards of a plan into `work`/clips, those that are not there yet; returns how many were made. One
     lesson needs nothing of another, so this may run in a process of its own."""
     missing = [row for row in rows if not shard_path(work / CLIPS, row[0]).is_file()]
     if not missing:
         return 0
     with native.one_thread(), one_torch_thread():
-        folder = fit_lesson(config, log, lesson, work / lesson.name)
+        folder = fit_lesson(config, log, lesson, work / lesson.name, fit_scene)
         device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
         model = model_of_window(mdm_files.load(config.model), config.block).to(device)
         maker = ClipMaker(config, log, lesson, model, folder)

@@ -14,7 +14,7 @@ A short fit to what a lesson shows gives the renders of its conditions, as `synt
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +29,7 @@ from mudg.data.clips.condition import ConditionRules, WarpSource, image_tensor, 
 from mudg.data.scene import photographs, read_image, read_points, read_scene, read_trusted_classes
 from mudg.data.scene.photos import write_photos
 from mudg.models.scene.model import SceneModel
-from mudg.stages import fit, fuse
-from mudg.stages.config import AdaptConfig, FuseConfig
+from mudg.stages.config import AdaptConfig, FitConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.short import short_fit
 from mudg.stages.fitting.storage import load_model
@@ -148,18 +147,20 @@ def carried(photo: Photo, target: View, model: SceneModel, width_px: int) -> Pho
 # the fit of a lesson --------------------------------------------------------------------------------------------------
 
 
-def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path) -> Path:
+FitScene = Callable[[FitConfig, Path, Path | None, Path], None]
+"""Fits a scene with these settings and fused clouds into a folder (`folder`/fit); without clouds it makes its own (`folder`/fuse)."""
+
+
+def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path, fit_scene: FitScene) -> Path:
     """Write what a lesson shows as a scene (`folder`/scene), fuse it where photographs are missing (`folder`/fuse), and fit it
     (`folder`/fit); returns `folder`. What is there already is used again."""
-    scene, cloud = read_scene(log.scene), log.fused
+    scene = read_scene(log.scene)
     if not (folder / "scene" / "scene.json").is_file():
         photos = shown_photos(scene, lesson, config, load_model(log.fitted), log.width_px * log.scale)
         sweeps = ((s.sensor, s.time_s, s.world_from_lidar, read_points(scene, s)) for s in scene.sweeps)
         write_photos(folder / "scene", scene.source, scene.ego, scene.tracks, photos, sweeps)
-    if not lesson.shift_m:
-        cloud = fuse.run(FuseConfig(), folder / "scene", folder / "fuse")
     camera = next(iter(scene.cameras.values()))
     device = "auto" if config.device.startswith("cuda") else "cpu"  # a GPU that lacks gsplat cannot draw
     settings = short_fit(config.fit_iterations, log.width_px, camera.width, config.seed, device)
-    fit.run(settings, folder / "scene", cloud, folder / "fit")
+    fit_scene(settings, folder / "scene", log.fused if lesson.shift_m else None, folder)
     return folder

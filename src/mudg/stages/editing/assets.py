@@ -9,19 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.processes import one_torch_thread
 from mudg.base.records import Number, StrictRecord, parse_record
-from mudg.base.result_file import ResultFile
-from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import View
 from mudg.data.scene import read_scene
 from mudg.models.scene.edited import Asset, asset_of, motion_of
@@ -31,7 +29,7 @@ from mudg.stages.editing.apply import views_of
 from mudg.stages.editing.checks import sides_seen
 from mudg.stages.editing.light import surface_light
 from mudg.stages.editing.plan import Actor
-from mudg.stages.editing.runs import RunParts, find_run
+from mudg.stages.editing.runs import RunParts
 from mudg.stages.fitting.rendering import raster_of
 from mudg.stages.fitting.storage import load_model
 
@@ -51,37 +49,20 @@ class AssetHeader(StrictRecord):
     origin: str
 
 
-def run_export(run: Path, name: str, out: Path, scene: Path | None = None, overwrite: bool = False) -> Path:
-    """``mudg asset export``: write one object of a fit, or of a folder of ``mudg run``, to a file; returns it.
-
-    Args:
-        scene: the scene that a fit belongs to, for the sides from which the object was seen; a run's own is found.
-
-    Raises:
-        UsageError: no such object, or another file is there and ``overwrite`` is not set.
-    """
-    refuse_overlap(out, {"run": run, "scene": scene})
-    if out.suffix != ".safetensors":
-        raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
-    parts = find_run(run)
-    place = scene or parts.scene
-    inputs = {"fit": store.digest(parts.model), **({} if place is None else {"scene": store.digest(place)})}
-    with ResultFile.open(out, "asset export", {"id": name}, inputs, overwrite=overwrite) as file:
-        if file.complete:
-            return file.reused()
-        asset = asset_from(parts, name, scene)
-        write_asset(file.staged(), asset)
-        log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions)")
-        return file.finish({"id": name, "inputs": inputs})
+def write_asset_from(parts: RunParts, name: str, out: Path) -> dict[str, Any]:
+    """Write one object of a fit, or of a run, to a file; returns what it is. UsageError where there is no such object."""
+    asset = asset_from(parts, name)
+    write_asset(out, asset)
+    log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions)")
+    return {"id": name}
 
 
-def asset_from(parts: RunParts, name: str, scene: Path | None = None) -> Asset:
+def asset_from(parts: RunParts, name: str) -> Asset:
     """An object of a run, with the sides from which its scene shows it; those that it never shows are closed."""
     model = load_model(parts.model)
-    place = scene or parts.scene
-    if place is None:
+    if parts.scene is None:
         return asset_of(model, name)
-    recorded = read_scene(place)
+    recorded = read_scene(parts.scene)
     return complete_asset(model, name, [frame.view for frame in recorded.frames])
 
 

@@ -9,23 +9,21 @@ messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from mudg.base import log, store
-from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
-from mudg.base.processes import one_torch_thread
-from mudg.base.result_file import ResultFile
-from mudg.base.run_folder import RunDir, VerbOutput, below, refuse_overlap
+from mudg.base.layout import below
 from mudg.base.types import PointCloud, Scene
 from mudg.base.versions import version
 from mudg.core.ground import HeightMap
 from mudg.core.sh import C0
 from mudg.data.cloudfile import read_fused
+from mudg.data.edits import EditScript
 from mudg.data.exporters.colmap import colmap_files
 from mudg.data.exporters.nerfstudio import nerfstudio_files
 from mudg.data.exporters.pictures import picture_names, pictures
@@ -36,10 +34,11 @@ from mudg.models.scene.edited import lowest_points
 from mudg.models.scene.model import SceneModel
 from mudg.stages.config import ExportConfig
 from mudg.stages.editing.apply import ground_of
-from mudg.stages.editing.carried import carry_out, read_and_digest
+from mudg.stages.editing.carried import carry_out
 from mudg.stages.editing.runs import RunParts, find_run
-from mudg.stages.exporting.messages import FOLDERS, Told, records_of, refuse_missing, write_file, write_folder
+from mudg.stages.exporting.messages import FOLDERS as LOG_FOLDERS
 from mudg.stages.exporting.messages import SUFFIXES as MESSAGES
+from mudg.stages.exporting.messages import Told, records_of, refuse_missing, write_log, write_messages
 from mudg.stages.exporting.scenes import splat_scene, with_sky_sphere
 from mudg.stages.fitting.storage import load_model, model_of_scene
 
@@ -50,7 +49,10 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
 """Formats of cameras: files beside the pictures."""
 _ALL_MOMENTS: Final = ("bundle", "alpasim")
 MOST_POINTS: Final = 500_000
-_FOLDER = VerbOutput("export", 1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
+FOLDERS: Final = {
+    **{name: (1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/")) for name in CAMERAS}, **LOG_FOLDERS
+}
+"""Formats that are folders: version and files of each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,51 +61,69 @@ class Exported:
 
     Args:
         parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene, edited, or None.
-        inputs: digests of what was read. named: files that the edit script names.
+        edited: whether an edit script was carried out.
     """
 
     parts: RunParts
     model: SceneModel | None
     log: Scene | None
-    inputs: dict[str, str]
-    named: dict[str, Path] = field(default_factory=dict)
+    edited: bool = False
+
+    @classmethod
+    def of(cls, parts: RunParts, script: EditScript | None) -> Exported:
+        """The parts of a source, with an edit script carried out."""
+        recorded = None if parts.scene is None else read_scene(parts.scene)
+        if not parts.fits and script is not None:
+            raise UsageError("an edit script is carried out on a fit", where="--edits", got=str(parts.scene),
+                remedy="give the folder of a run")  # fmt: skip
+        if not parts.fits:
+            return cls(parts, None, recorded)
+        model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
+        if script is None:
+            return cls(parts, model, recorded)
+        drive = carry_out(script, model, recorded)
+        return cls(parts, drive.model(model), drive.scene or recorded, edited=True)
 
 
-@one_torch_thread()
-def run(
-    config: ExportConfig, name: str, source: Path, out: Path, *,
-    scene: Path | None = None, edits: Path | None = None, overwrite: bool = False,
-) -> Path:  # fmt: skip
-    """Export in a format; returns ``out``.
+def parts_of(name: str, source: Path, scene: Path | None) -> RunParts:
+    """Where the parts of a source lie: of a fit, a run, or, for formats without Gaussians, a scene."""
+    alone = name not in FORMATS and ((source / "scene.json").is_file() or source.suffix == ".zip")
+    parts = RunParts({}, source, None, False) if alone else find_run(source)
+    return replace(parts, scene=scene or parts.scene)
 
-    Args:
-        name: of the format. source: folder of a fit, of a finished ``mudg run``, or, for cameras, of a scene.
-        scene: the scene that a fit belongs to; a run's own is found. edits: an edit script to carry out before.
 
-    Raises:
-        UsageError: an unknown format, or a setting that it does not have. InputError: nothing that can be exported.
-    """
+def check(config: ExportConfig, name: str, out: Path) -> None:
+    """UsageError for an unknown format, a setting that it does not have, or a file whose name does not fit it; ResourceError for a package
+    that is missing."""
     if name not in FORMATS and name not in CAMERAS and name not in MESSAGES:
         known = ", ".join((*FORMATS, *CAMERAS, *MESSAGES))
         raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
-    cameras = name in CAMERAS
-    refuse_overlap(out, {"run": source, "scene": scene, "edits": edits})
     _refuse_settings(config, name)
     refuse_missing(name)
-    if not (cameras or name in FOLDERS):
+    if name not in FOLDERS:
         _refuse_name(out, name)
-    given = _opened(source, scene, edits, name in FORMATS)
-    refuse_overlap(out, {"scene": given.parts.scene, **given.named})
-    settings = {**result_settings(config), "format": name}
-    if cameras or name in FOLDERS:
-        recorded = _known(given)
-        folder = RunDir.open(out, _FOLDER if cameras else FOLDERS[name], settings, given.inputs, overwrite)
-        return _cameras(name, given, recorded, folder) if cameras else write_folder(name, records_of(recorded, _points(given)), folder)
-    with ResultFile.open(Path(out), "export", settings, given.inputs, overwrite=overwrite) as file:
-        if file.complete:
-            return file.reused()
-        about = (_messages if name in MESSAGES else _gaussians)(config, name, given, file.staged())
-        return file.finish({"format": name, "mudg": version(), **about, "inputs": given.inputs})
+
+
+def write_folder(name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write cameras, or a log over time, to the work folder; returns a summary."""
+    recorded = _known(given)
+    if name not in CAMERAS:
+        return write_messages(name, records_of(recorded, _points(given)), out)
+    names = picture_names(recorded)
+    with log.task("export", len(names)) as bar:
+        for place, content in pictures(recorded):
+            if not (out / place).is_file():
+                store.atomic_write(out / place, content)
+            bar.advance()
+    for place, content in CAMERAS[name](recorded, _points(given)).items():
+        store.atomic_write(out / place, content)
+    return {"format": name, "images": len(names)}
+
+
+def write_file(config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write Gaussians, or a log over time, as one file; returns what the file is."""
+    about = (_messages if name in MESSAGES else _gaussians)(config, name, given, out)
+    return {"format": name, "mudg": version(), **about}
 
 
 def _refuse_settings(config: ExportConfig, name: str) -> None:
@@ -133,34 +153,6 @@ def _refuse_name(out: Path, name: str) -> None:
     if not Path(out).name.lower().endswith(suffixes):
         expected = f"a name that ends in {' or '.join(suffixes)}"
         raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
-
-
-def _opened(source: Path, scene: Path | None, edits: Path | None, needs_model: bool) -> Exported:
-    """The parts of a source, with an edit script carried out."""
-    source = Path(source)
-    alone = not needs_model and ((source / "scene.json").is_file() or source.suffix == ".zip")
-    parts = RunParts({}, source, None, False) if alone else find_run(source)
-    place = scene or parts.scene
-    inputs = {f"fit {key}".strip(): store.digest(path) for key, path in parts.fits.items() if path == parts.model}
-    inputs |= {key: store.digest(path) for key, path in (("scene", place), ("fused", parts.fused)) if path is not None}
-    recorded = None if place is None else read_scene(place)
-    if alone and edits is None:
-        return Exported(parts, None, recorded, inputs)
-    if alone:
-        raise UsageError(
-            "an edit script is carried out on a fit",
-            where="--edits",
-            got=str(source),
-            remedy="give the folder of a run",
-        )
-    model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
-    named: dict[str, Path] = {}
-    if edits is not None:
-        script, inputs["edits"] = read_and_digest(Path(edits))
-        drive = carry_out(script, model, recorded)
-        model, recorded = drive.model(model), drive.scene or recorded
-        named = {f"{edits}: {name}": path for name, path in script.files().items()}
-    return Exported(parts, model, recorded, inputs, named)
 
 
 # -- Gaussians -----------------------------------------------------------------------------------------------------------
@@ -229,27 +221,7 @@ def _count(scene: SplatScene) -> int:
     return sum(len(node.cloud) for node in scene.nodes)
 
 
-# -- cameras -------------------------------------------------------------------------------------------------------------
-
-
-def _cameras(name: str, given: Exported, recorded: Scene, folder: RunDir) -> Path:
-    """A folder of cameras, pictures and starting points."""
-    if folder.complete:
-        return folder.reused()
-    names = picture_names(recorded)
-    try:
-        with log.task("export", len(names)) as bar:
-            for place, content in pictures(recorded):
-                if not (folder.path / place).is_file():
-                    store.atomic_write(folder.path / place, content)
-                bar.advance()
-    except KeyboardInterrupt:
-        folder.pause()
-        raise
-    for place, content in CAMERAS[name](recorded, _points(given)).items():
-        store.atomic_write(folder.path / place, content)
-    folder.finish({"format": name, "images": len(names)})
-    return folder.path
+# -- cameras and messages -----------------------------------------------------------------------------------------------
 
 
 def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
@@ -259,7 +231,7 @@ def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> d
         splats = splat_scene(given.model, middle_s(given.model, given.log))
     if name != "rerun" or given.log is not None:
         records = records_of(_known(given), _points(given) if splats is None else None)
-    return write_file(name, Told(records, splats), out)
+    return write_log(name, Told(records, splats), out)
 
 
 def _known(given: Exported) -> Scene:
@@ -267,7 +239,7 @@ def _known(given: Exported) -> Scene:
     if given.log is None:
         raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
             remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
-    if given.model is not None and "edits" in given.inputs:
+    if given.edited:
         log.warn(
             "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"
         )

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 
 from mudg.base import geometry, log, store
-from mudg.base.config import result_settings
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
-from mudg.base.result_file import ResultFile
-from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.data.splats import axes
 from mudg.data.splats.binary import MAX_BYTES
 from mudg.data.splats.cloud import SplatCloud, spacing_m
@@ -34,36 +31,29 @@ SOLID: Final = 0.3
 """Opacity from which Gaussians count for the size of an object."""
 OUTSIDE: Final = 0.5
 """Percent of the solid Gaussians at either end of an axis that may stand out of the box."""
-_FOLDER = VerbOutput("asset", 1, ("model.json", "gaussians.safetensors", "nodes.safetensors"))
 
 
-def run(config: ImportConfig, file: Path, out: Path, *, overwrite: bool = False) -> Path:
-    """Import a file; returns ``out``.
+def write_object(config: ImportConfig, file: Path, out: Path) -> dict[str, Any]:
+    """Write the asset of a file; returns what it is."""
+    cloud, found = read_file(file, config)
+    asset = asset_of_cloud(cloud, config, f"{file.name} ({found})")
+    write_asset(out, asset)
+    length, width, height = asset.size_m
+    log.info(f"asset: {len(asset)} Gaussians of a {found} file, {length:.2f} x {width:.2f} x {height:.2f} m")
+    if cloud.degree:
+        log.info("asset: colours that depend on the direction of view are not kept")
+    return {"format": found}
 
-    Raises:
-        InputError: no such file, another format, or a damaged one. UsageError: the output exists. ResourceError: a package is missing.
-    """
-    refuse_overlap(out, {"file": file})
-    refuse_other_settings(config)
-    if config.kind == "scene":
-        return _scene(config, Path(file), Path(out), overwrite)
-    if Path(out).suffix != ".safetensors":
-        raise UsageError(
-            "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
-        )
-    source = _of_bounded_size(Path(file))
-    settings, inputs = {**result_settings(config), "name": source.name}, {"file": store.digest(source)}
-    with ResultFile.open(Path(out), "asset import", settings, inputs, overwrite=overwrite) as result:
-        if result.complete:
-            return result.reused()
-        cloud, found = read_file(source, config)
-        asset = asset_of_cloud(cloud, config, f"{source.name} ({found})")
-        write_asset(result.staged(), asset)
-        length, width, height = asset.size_m
-        log.info(f"asset: {len(asset)} Gaussians of a {found} file, {length:.2f} x {width:.2f} x {height:.2f} m")
-        if cloud.degree:
-            log.info("asset: colours that depend on the direction of view are not kept")
-        return result.finish({"format": found, "inputs": inputs})
+
+def write_scene(config: ImportConfig, read: tuple[SplatCloud, str], file: Path, out: Path) -> dict[str, Any]:
+    """The folder of a fit in which nothing moves, of Gaussians and their format; returns a summary."""
+    cloud, found = read
+    origin = _origin(cloud, config, file)
+    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(0.0, [-value for value in origin])
+    model = model_of_cloud(cloud.moved(begin), file.name)
+    save_model(replace(model, facts={**model.facts, "format": found}), out)
+    log.info(f"asset: a scene of {len(cloud)} Gaussians of a {found} file")
+    return {"gaussians": len(cloud), "format": found, "origin_m": origin}
 
 
 def refuse_other_settings(config: ImportConfig) -> None:
@@ -82,10 +72,11 @@ def refuse_other_settings(config: ImportConfig) -> None:
 
 def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
     """The Gaussians of a file in the axes of this program, and its format."""
-    return read_cloud(store.read_bytes(_of_bounded_size(file)), str(file), config.axes)
+    return read_cloud(store.read_bytes(bounded(file)), str(file), config.axes)
 
 
-def _of_bounded_size(file: Path) -> Path:
+def bounded(file: Path) -> Path:
+    """The file; InputError for one that is too large to be read."""
     size = store.regular(file).stat().st_size
     if size > MAX_BYTES:
         raise InputError("the file is too large", where=str(file), expected=f"at most {MAX_BYTES} bytes", got=str(size))
@@ -122,21 +113,6 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
     length, width, height = (float(value) for value in size * scale)
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     return Asset(tensors, ids, None, config.label, (length, width, height), None, (), origin)
-
-
-def _scene(config: ImportConfig, file: Path, out: Path, overwrite: bool) -> Path:
-    """The folder of a fit in which nothing moves."""
-    cloud, found = read_file(file, config)
-    folder = RunDir.open(out, _FOLDER, result_settings(config), {"file": store.digest(file)}, overwrite)
-    if folder.complete:
-        return folder.reused()
-    origin = _origin(cloud, config, file)
-    begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(0.0, [-value for value in origin])
-    model = model_of_cloud(cloud.moved(begin), file.name)
-    save_model(replace(model, facts={**model.facts, "format": found}), folder.path)
-    folder.finish({"gaussians": len(cloud), "format": found, "origin_m": origin})
-    log.info(f"asset: a scene of {len(cloud)} Gaussians of a {found} file in {out}")
-    return folder.path
 
 
 def _origin(cloud: SplatCloud, config: ImportConfig, file: Path) -> list[float]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import log, store
-from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import Scene
 from mudg.base.versions import version
 from mudg.data import ncore as ncore_package
@@ -22,8 +21,8 @@ from mudg.data.splats.cloud import SplatScene
 
 SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
-FOLDERS: Final = {"ros2": VerbOutput("export", 1, (ros2.METADATA, ros2.FILE)), "ncore": VerbOutput("export", 1, ncore.FILES)}
-"""What formats that are folders consist of."""
+FOLDERS: Final = {"ros2": (1, (ros2.METADATA, ros2.FILE)), "ncore": (1, ncore.FILES)}
+"""Formats that are folders: version and files of each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +57,7 @@ def refuse_missing(name: str) -> None:
         ncore_package.package()
 
 
-def write_file(name: str, told: Told, out: Path) -> dict[str, int]:
+def write_log(name: str, told: Told, out: Path) -> dict[str, int]:
     """Write a log as one file, ``mcap`` or ``rerun``; returns its size."""
     if name == "rerun":
         title = told.records.scene.id if told.records is not None else "scene"
@@ -70,20 +69,12 @@ def write_file(name: str, told: Told, out: Path) -> dict[str, int]:
     return {"bytes": size}
 
 
-def write_folder(name: str, records: LogRecords, folder: RunDir) -> Path:
-    """Write a log as a folder: ``ros2`` or ``ncore``."""
-    if folder.complete:
-        return folder.reused()
-    try:
-        content, summary = _bag(records, folder.path) if name == "ros2" else _recording(records, folder.path)
-    except KeyboardInterrupt:
-        folder.pause()
-        raise
-    size = content.stat().st_size
-    folder.finish({"format": name, **summary})
+def write_messages(name: str, records: LogRecords, out: Path) -> dict[str, Any]:
+    """Write a log as a folder, ``ros2`` or ``ncore``; returns a summary."""
+    content, summary = _bag(records, out) if name == "ros2" else _recording(records, out)
     told = "".join(f", {count} {what}" for what, count in summary.items())
-    log.info(f"export: {Told(records).summary}{told}, {size / 1e6:.2f} MB in {folder.path}")
-    return folder.path
+    log.info(f"export: {Told(records).summary}{told}, {content.stat().st_size / 1e6:.2f} MB in {out}")
+    return {"format": name, **summary}
 
 
 def _bag(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mudg.base import seeds
+from mudg.base.config import result_settings
 from mudg.base.renders import RenderPlanes
+from mudg.base.run_folder import RunDir
 from mudg.base.types import View
 from mudg.data.clips import from_city
 from mudg.data.clips.city_log import CityLog
@@ -36,7 +38,9 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
         folder = Path(text)
         write_photos(folder / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, placed_sweeps(log))
         write_fused(folder / "fused", log.cloud, {})
-        model = fit.load_model(fit.run(config, folder / "scene", folder / "fused", folder / "fit"))
+        work = RunDir.open(folder / "fit", fit.OUTPUT, result_settings(config), {})
+        fit.write_fit(config, fit.FitInputs(folder / "scene", folder / "fused"), work)
+        model = fit.load_model(work.path)
 
     def render_at(view: View) -> RenderPlanes:
         return render_planes(model, view)

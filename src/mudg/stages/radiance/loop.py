@@ -72,8 +72,8 @@ class RadianceState:
         return {"parameters": count, "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def fit_radiance(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> None:
-    """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint."""
+def fit_radiance(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> dict[str, Any]:
+    """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns a summary."""
     with one_torch_thread(), memory_of(device, "fit"):
         state = prepare(config, scene, folder, device)
         optimise(state, config, folder)
@@ -81,7 +81,7 @@ def fit_radiance(config: FitConfig, scene: Scene, folder: RunDir, device: torch.
     write_preview(state.field, state.shown, budget, folder.path / "preview" / "final.png", whole=True)
     save_field(state.field, budget, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
-    folder.finish(state.summary())
+    return state.summary()
 
 
 def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> RadianceState:

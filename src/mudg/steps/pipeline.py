@@ -1,4 +1,4 @@
-"""The chain behind ``mudg demo`` and ``mudg run``: every verb in order, each skipped when its result verifies.
+"""The pipeline behind ``mudg demo`` and ``mudg run``: steps in order, each skipped when its result verifies.
 
 OUT/scene  OUT/fuse  OUT/adapt  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>  OUT/score
 OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
@@ -21,6 +21,15 @@ from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
 from mudg.stages.config import FitConfig, RunConfig, SynthesizeConfig, with_device
 from mudg.stages.config.presets import NO_MODEL, PRESETS
+from mudg.steps.adapt import Adapt
+from mudg.steps.annotate import Annotate
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
+from mudg.steps.outputs import Output
+from mudg.steps.render import RenderViews
+from mudg.steps.score import Score
+from mudg.steps.synthesize import Synthesize
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -35,15 +44,6 @@ def fits_of(config: FitConfig, continued: bool = True) -> tuple[FitConfig, FitCo
     ``continued`` is off."""
     further = max(1, round(CONTINUED_SHARE * config.iterations)) if continued else config.iterations
     return replace(config, method=WITHOUT_DIFFUSION), replace(config, method=WITH_DIFFUSION, iterations=further)
-
-
-@dataclass(frozen=True)
-class ChainStep:
-    """One step of the chain: the name in tables, the folder it fills (relative to OUT), and what does it."""
-
-    name: str
-    folder: str
-    make: Callable[[], Any]
 
 
 def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
@@ -85,16 +85,16 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     """The chain, alone in its folder."""
     from mudg.pages import run_report
 
-    ledger = _Ledger.open(out, config, str(source), overwrite)
+    ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
     config = with_device(config)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
-        for step in _steps(config, scene, out, overwrite):
-            ledger.timed(step)
+        for name, step in steps_of(config, scene, out, overwrite).items():
+            ledger.timed(name, step.out, step.run)
         key = _report_key(out)
         if not ledger.has_report(key):
-            ledger.timed(ChainStep("viewer", "viewer.html", lambda: _write_viewer(out)))
-        reels = None if ledger.has_report(key) else ledger.timed(ChainStep("report", "report.html", lambda: run_report.film(out)))
+            ledger.timed("viewer", out / "viewer.html", lambda: _write_viewer(out))
+        reels = None if ledger.has_report(key) else ledger.timed("report", page, lambda: run_report.film(out))
     except KeyboardInterrupt:
         ledger.save("interrupted")
         raise
@@ -106,7 +106,6 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     if reels is not None:  # written last, when the seconds of all steps are known
         run_report.write_page(out, reels)
         ledger.remember_report(key)
-    page = out / "report.html"
     return {
         "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
         "text": _closing_text(out, page, ledger),
@@ -175,21 +174,18 @@ def _is_own_scene(source: str | Path, out: Path) -> bool:
 
 def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Ledger, overwrite: bool) -> Path:
     """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate. InputError without LiDAR."""
-    from mudg.stages import annotate, ingest
-
     if str(source) != CITY and _is_scene(source):
         scene = Path(source)
     else:
         of_preset = config.ingest.resolution == PRESETS["fast"]["ingest.resolution"]  # which is for logs: a city has a size of its own
         settings = replace(config.ingest, resolution="") if str(source) == CITY and of_preset else config.ingest
-        scene = ledger.timed(ChainStep("ingest", "scene", lambda: ingest.run(settings, str(source), out / "scene", overwrite=overwrite)))
+        ingest = Ingest(log=str(source), out=out / "scene", overwrite=overwrite, settings=settings)
+        scene = ledger.timed("ingest", ingest.out, ingest.run)
     if not ledger.has_done("fuse"):
         log.info(_forecast(config, scene))
     if not _has_semantics(scene):
-        labelled = out / "annotate"
-        return ledger.timed(
-            ChainStep("annotate", "annotate", lambda: annotate.run(config.annotate, scene, labelled, overwrite=overwrite))
-        )
+        step = Annotate(scene=scene, out=out / "annotate", overwrite=overwrite, settings=config.annotate)
+        return ledger.timed("annotate", step.out, step.run)
     return scene
 
 
@@ -257,52 +253,28 @@ def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
     return loaded.source.recipe is not None, why_not(loaded, replace(config.adapt, cameras=config.synthesize.cameras))
 
 
-def _steps(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> tuple[ChainStep, ...]:
-    from mudg.stages import adapt, fit, fuse, render, score, synthesize
-
-    fused, virtual = out / "fuse", out / "synthesize"
+def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict[str, Output]:
+    """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it write."""
     diffusion = _diffusion_of(config, scene)
     plain, guided = fits_of(config.fit, config.continue_fit)
-    models = {name: out / "fit" / name for name in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
-    renders = {name: out / "render" / name for name in models}
-
-    def adapted() -> Path:
-        settings = replace(config.adapt, model=config.synthesize.model, cameras=config.synthesize.cameras)
-        return adapt.run(settings, scene, fused, models[WITHOUT_DIFFUSION], out / "adapt", overwrite=overwrite)
-
-    def synthesized() -> Path:
-        settings = replace(config.synthesize, model=str(out / "adapt" / "model")) if diffusion.adapts else config.synthesize
-        rendered_scene = models[WITHOUT_DIFFUSION] if diffusion.renders else None
-        return synthesize.run(settings, scene, fused, virtual, fitted=rendered_scene, overwrite=overwrite)
-
-    def fitted_guided() -> Path:
-        return fit.run(
-            guided, scene, fused, models[WITH_DIFFUSION],
-            observations=virtual, start=models[WITHOUT_DIFFUSION] if config.continue_fit else None, overwrite=overwrite,
-        )  # fmt: skip
-
-    def rendered(name: str) -> Path:
-        return render.run(config.render, scene, models[name], renders[name], overwrite=overwrite)
-
-    def scored() -> Path:
-        compared = {
-            WITHOUT_DIFFUSION: renders[WITHOUT_DIFFUSION],
-            DIFFUSION: virtual,
-            WITH_DIFFUSION: renders[WITH_DIFFUSION],
-        }
-        return score.run(config.score, scene, compared, out / "score", fused=fused, overwrite=overwrite)
-
-    return (
-        ChainStep("fuse", "fuse", lambda: fuse.run(config.fuse, scene, fused, overwrite=overwrite)),
-        ChainStep("fit without diffusion", f"fit/{WITHOUT_DIFFUSION}",
-             lambda: fit.run(plain, scene, fused, models[WITHOUT_DIFFUSION], overwrite=overwrite)),
-        *((ChainStep("adapt", "adapt", adapted),) if diffusion.adapts else ()),
-        ChainStep("synthesize", "synthesize", synthesized),
-        ChainStep("fit with diffusion", f"fit/{WITH_DIFFUSION}", fitted_guided),
-        ChainStep("render without diffusion", f"render/{WITHOUT_DIFFUSION}", lambda: rendered(WITHOUT_DIFFUSION)),
-        ChainStep("render with diffusion", f"render/{WITH_DIFFUSION}", lambda: rendered(WITH_DIFFUSION)),
-        ChainStep("score", "score", scored),
-    )  # fmt: skip
+    first, last = out / "fit" / WITHOUT_DIFFUSION, out / "fit" / WITH_DIFFUSION
+    fused, adapted, virtual, render = out / "fuse", out / "adapt", out / "synthesize", out / "render"
+    adaptation = replace(config.adapt, model=config.synthesize.model, cameras=config.synthesize.cameras)
+    generator = replace(config.synthesize, model=str(adapted / "model")) if diffusion.adapts else config.synthesize
+    compared = {WITHOUT_DIFFUSION: render / WITHOUT_DIFFUSION, DIFFUSION: virtual, WITH_DIFFUSION: render / WITH_DIFFUSION}
+    steps: dict[str, Output] = {
+        "fuse": Fuse(scene=scene, out=fused, settings=config.fuse),
+        "fit without diffusion": Fit(scene=scene, fused=fused, out=first, settings=plain),
+        "adapt": Adapt(scene=scene, fused=fused, fitted=first, out=adapted, settings=adaptation),
+        "synthesize": Synthesize(scene=scene, fused=fused, fitted=first if diffusion.renders else None, out=virtual, settings=generator),
+        "fit with diffusion": Fit(
+            scene=scene, fused=fused, observations=(virtual,), start_from=first if config.continue_fit else None, out=last, settings=guided
+        ),
+        "render without diffusion": RenderViews(scene=scene, model=first, out=render / WITHOUT_DIFFUSION, settings=config.render),
+        "render with diffusion": RenderViews(scene=scene, model=last, out=render / WITH_DIFFUSION, settings=config.render),
+        "score": Score(scene=scene, views=compared, fused=fused, out=out / "score", settings=config.score),
+    }
+    return {name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or diffusion.adapts}
 
 
 def _report_key(out: Path) -> str:
@@ -423,26 +395,26 @@ class _Ledger:
         """Whether a step has ended before."""
         return self._steps.get(step, {}).get("state") == "complete"
 
-    def timed(self, step: ChainStep) -> Any:
-        """Do one step and add its seconds, also when it is interrupted; a reused result adds none. The next step begins with the memory
-        that this one took given back."""
+    def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
+        """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result adds none. The
+        next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
-        finished = self._steps.get(step.name, {}).get("state") == "complete" and (self._out / step.folder).exists()
+        finished = self.has_done(name) and result.exists()
         meter, state = Meter(), "interrupted"
-        log.info(f"== {step.name}")
+        log.info(f"== {name}")
         try:
-            path = step.make()
+            made = run()
             release_memory()
             state = "complete"
         finally:
-            spent, known = meter.stop(), self._steps.get(step.name, {})
+            spent, known = meter.stop(), self._steps.get(name, {})
             earlier = Usage.of_record(known)
             if not (finished and state == "complete" and spent.seconds < earlier.seconds):
                 spent = spent if finished else earlier.then(spent)
-                self._steps[step.name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(self._out / step.folder)}
+                self._steps[name] = {"state": state, **spent.record(), "written_bytes": folder_bytes(result)}
             self.save("running")
-        return path
+        return made
 
     def seconds(self) -> dict[str, float]:
         """Seconds per step, in order."""

@@ -62,7 +62,7 @@ class Bench(Output):
         named = {word for tag in tags for word in tag if word in cls.parts}
         return not named or part in named
 
-    def run(self) -> Path:
+    def act(self) -> Path:
         from mudg.benchmarks import run as bench
 
         return bench.run(self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite)
