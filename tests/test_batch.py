@@ -81,7 +81,7 @@ def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.Captur
     words = (sys.executable, str(tmp_path / "step.py"), "{source}", "{out}")
     plan = BatchPlan((BatchStage("command", words, direct=True),))
     entries = [lists.Entry(name, f"/logs/{name}") for name in names]
-    result = run_listed(ListedRun("ingest", None, entries, tmp_path / "out", jobs=2, shard_text="0/1"), plan)
+    result = run_listed(ListedRun(("ingest",), None, entries, tmp_path / "out", jobs=2, shard_text="0/1"), plan)
     assert result["exit_code"] == 13
     states = {record["name"]: (record["state"], record["words"]) for record in result["scenes"]}
     assert list(states) == ["bad", "killed", "bug", "good"]

@@ -284,7 +284,7 @@ def wait_until(condition, seconds: float) -> None:
 
 def test_status_of_a_hundred_thousand_scenes(tmp_path: Path) -> None:
     count = int(os.environ.get("MUDG_TEST_SCENES", "100000"))
-    folder, plan = BatchFolder(Location.of(tmp_path)), plan_of((), {}, ("program", "{out}"))
+    folder, plan = BatchFolder(Location.of(tmp_path)), plan_of((), {}, {}, ("program", "{out}"))
     entries = [Entry(f"scene{number:06d}", f"/logs/{number}") for number in range(count)]
     folder.begin(plan, entries)
     for kind in ("done", "failed"):

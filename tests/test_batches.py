@@ -27,6 +27,7 @@ from mudg.stages.batches.plan import BatchPlan, BatchStage, Entry, command_of, p
 from mudg.stages.batches.records import BatchFolder, Ended, this_host
 from mudg.stages.batches.work import Job, facts_of
 from mudg.stages.config import BatchConfig, RunConfig
+from mudg.steps.batch import stage_lines
 
 STEP = """
 # step.sh NAME OUT TALLY: a line per run; then what is in TALLY/NAME.do, or a small result
@@ -34,6 +35,8 @@ echo run >> "$3/$1.runs"
 [ -f "$3/$1.do" ] && . "$3/$1.do"
 mkdir -p "$2" && echo "result of $1" > "$2/x.txt"
 """
+
+LINES = stage_lines()
 
 
 class Scenes:
@@ -45,7 +48,7 @@ class Scenes:
         (folder / "step.sh").write_text(STEP)
         self.entries = [Entry(f"s{number}", f"/logs/{number}") for number in range(count)]
         self.command = ("sh", str(folder / "step.sh"), "{name}", "{out}", str(self.tally))
-        self.plan = plan_of((), {}, self.command)
+        self.plan = plan_of((), {}, {}, self.command)
         self.batch = BatchFolder(out or Location.of(folder / "out"))
         (folder / "list.txt").write_text("".join(f"city name={entry.name}\n" for entry in self.entries))
 
@@ -91,13 +94,13 @@ def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
 
 def test_a_key_depends_on_log_settings_and_what_is_read() -> None:
     settings = {"ingest": {"frames": "", "device": "auto"}, "fuse": {"voxel_m": 0.0}}
-    plan = plan_of(("ingest", "fuse"), settings)
+    plan = plan_of(("ingest", "fuse"), LINES, settings)
     first, second = plan.units(Entry("a", "/logs/a"))
     assert second.needs == {"ingest": first.key}
     assert [unit.key for unit in plan.units(Entry("a", "/logs/a"))] == [first.key, second.key]
-    other = plan_of(("ingest", "fuse"), {**settings, "ingest": {"frames": "0:5"}})
+    other = plan_of(("ingest", "fuse"), LINES, {**settings, "ingest": {"frames": "0:5"}})
     assert {unit.key for unit in other.units(Entry("a", "/logs/a"))}.isdisjoint({first.key, second.key})
-    device = plan_of(("ingest", "fuse"), {**settings, "ingest": {"frames": "", "device": "cuda"}})
+    device = plan_of(("ingest", "fuse"), LINES, {**settings, "ingest": {"frames": "", "device": "cuda"}})
     assert next(iter(device.units(Entry("a", "/logs/a")))).key == first.key
     for changed in (Entry("a", "/logs/b"), Entry("a", "/logs/a", {"revision": "2"}), Entry("a", "/logs/a", {"frames": "0:3"})):
         assert next(iter(plan.units(changed))).key != first.key
@@ -105,24 +108,24 @@ def test_a_key_depends_on_log_settings_and_what_is_read() -> None:
 
 def test_steps_need_what_they_read() -> None:
     values = {name: {} for name in ("ingest", "annotate", "fuse", "fit", "render", "synthesize", "score")}
-    plan = plan_of(("ingest", "annotate", "fuse", "fit", "render", "score"), values)
+    plan = plan_of(("ingest", "annotate", "fuse", "fit", "render", "score"), LINES, values)
     assert {stage.name: stage.needs for stage in plan.stages} == {
         "ingest": (), "annotate": ("ingest",), "fuse": ("annotate",), "fit": ("annotate", "fuse"), "render": ("annotate", "fit"),
         "score": ("annotate", "fuse", "render"),
     }  # fmt: skip
-    assert plan_of(("fuse",), values).stages[0].words == ("fuse", "{source}")
+    assert plan_of(("fuse",), LINES, values).stages[0].words == ("fuse", "{source}")
     for names in (("fit",), ("ingest", "ingest"), ("nothing",), ()):
         with pytest.raises(UsageError):
-            plan_of(names, values)
+            plan_of(names, LINES, values)
     with pytest.raises(UsageError, match="where to write"):
-        plan_of((), {}, ("program",))
+        plan_of((), {}, {}, ("program",))
 
 
 def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
     values = {"ingest": {}, "fuse": {}}
     entry = Entry("a", "city", {"frames": "0:5", "cameras": "front,left", "seed": "7", "revision": "2"})
-    ingest, fuse = plan_of(("ingest", "fuse"), values).units(entry)
-    (chain,) = plan_of(("run",), values).units(entry)
+    ingest, fuse = plan_of(("ingest", "fuse"), LINES, values).units(entry)
+    (chain,) = plan_of(("run",), LINES, values).units(entry)
     flags = {unit.stage.name: command_of(unit, {"source": "city", "ingest": "i"}, "o", "") for unit in (ingest, fuse, chain)}
     assert flags["ingest"][-5:] == ["--frames=0:5", "--cameras", "front", "left", "--city.seed=7"]
     assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
@@ -187,7 +190,7 @@ def test_an_output_of_another_batch_or_of_something_else_is_refused(tmp_path: Pa
     made = Scenes(tmp_path)
     made.run()
     with pytest.raises(UsageError, match="other steps"):
-        made.batch.begin(plan_of((), {}, (*made.command, "--more")), made.entries)
+        made.batch.begin(plan_of((), {}, {}, (*made.command, "--more")), made.entries)
     made.batch.begin(made.plan, [*made.entries, Entry("more", "/logs/more")])  # a longer list is the same batch
     assert made.batch.scenes() == ["more", "s0", "s1", "s2"]
     (tmp_path / "b").mkdir()
@@ -552,9 +555,9 @@ def test_paths_in_settings_are_made_absolute(tmp_path: Path, monkeypatch: pytest
     (tmp_path / "models/net").mkdir(parents=True)
     settings = batch.settings_of("default", None, ["annotate.weights=models/net", "fit.iterations=5"])
     assert settings.fit.iterations == 5
-    plan = batch.plan_for(BatchConfig(stages=("ingest", "annotate")), settings)
+    plan = batch.plan_for(BatchConfig(stages=("ingest", "annotate")), settings, LINES)
     assert plan.stages[1].settings["weights"] == str(tmp_path / "models/net")
-    assert batch.plan_for(BatchConfig(), RunConfig()).stages[0].name == "run"
+    assert batch.plan_for(BatchConfig(), RunConfig(), LINES).stages[0].name == "run"
 
 
 # ---- templates for schedulers -------------------------------------------------------------------------------------------

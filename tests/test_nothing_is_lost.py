@@ -248,7 +248,7 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
     entries = [Entry("c", str(scenes / "a"))]
     for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
         with pytest.raises(UsageError, match=words):
-            run_listed(ListedRun("fuse", FuseConfig(), entries, tmp_path, jobs=1, listed=list_file))
+            run_listed(ListedRun(("fuse", "{source}"), FuseConfig(), entries, tmp_path, jobs=1, listed=list_file))
     assert (tmp_path / "status.json").read_text() == "scenes/a\n"
 
 

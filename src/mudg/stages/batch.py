@@ -50,14 +50,15 @@ class BatchRequest:
 
     Args:
         listed: path or address of the list. out: path or address of the results. batch: where scenes run. run: settings of the steps.
-            shard: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array job. scratch: folder for unfinished results.
-            take_over: drive the batch even if another driver may be alive elsewhere.
+            lines: words of every step (``plan_of``). shard: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array job.
+            scratch: folder for unfinished results. take_over: drive the batch even if another driver may be alive elsewhere.
     """
 
     listed: str
     out: str
     batch: BatchConfig
     run: RunConfig
+    lines: Mapping[str, Sequence[str]]
     shard: str = ""
     wait: bool = False
     scratch: Path | None = None
@@ -81,7 +82,7 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
     part = parse_shard(asked.shard)
     if asked.shard and asked.batch.engine != "local":
         raise UsageError("the engine itself shares out the list", where="--shard", got=f"--engine {asked.batch.engine}")
-    plan, folder = plan_for(asked.batch, asked.run), BatchFolder(Location.of(asked.out))
+    plan, folder = plan_for(asked.batch, asked.run, asked.lines), BatchFolder(Location.of(asked.out))
     if folder.out.local is not None:
         folder = BatchFolder(Location.of(folder.out.local.absolute()))
     _refuse_overlap(listed, folder, asked.listed)
@@ -149,12 +150,13 @@ def _submitted(
     return {**result, "exit_code": exit_code(sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries))}
 
 
-def plan_for(batch: BatchConfig, settings: RunConfig) -> BatchPlan:
+def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]]) -> BatchPlan:
     """The plan that settings ask for; paths in the settings that exist from here are made absolute, since steps run elsewhere."""
     values = _with_absolute_paths(configuration.to_dict(settings))
     own = bool(batch.command) and batch.stages == BatchConfig().stages
     command = tuple(os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word for word in batch.command)
-    return plan_of(() if own else tuple(name for name in batch.stages if name != COMMAND or command), values, command)
+    names = () if own else tuple(name for name in batch.stages if name != COMMAND or command)
+    return plan_of(names, lines, values, command)
 
 
 def _with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:

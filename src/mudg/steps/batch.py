@@ -6,7 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from mudg.steps.annotate import Annotate
+from mudg.steps.command import words_of
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
+from mudg.steps.render import RenderViews
+from mudg.steps.run import Run
+from mudg.steps.score import Score
 from mudg.steps.step import Flag, Step
+from mudg.steps.synthesize import Synthesize
 
 if TYPE_CHECKING:
     from mudg.stages.config import BatchConfig, PresetName
@@ -62,9 +71,23 @@ class BatchRun(Step):
 
         settings = batch.settings_of(self.preset, self.config, self.set)
         request = batch.BatchRequest(
-            self.list, self.out, self.settings, settings, self.shard, self.wait, self.scratch, self.take_over
+            self.list, self.out, self.settings, settings, stage_lines(), self.shard, self.wait, self.scratch, self.take_over
         )
         return batch.run(request, self.dry_run)
+
+
+def stage_lines() -> dict[str, tuple[str, ...]]:
+    """Command lines of the steps that a batch can do for each of its scenes, with names of other steps for their results."""
+    scene = {"scene": "{scene}", "fused": "{fuse}"}
+    steps = (
+        Run.build({"source": "{source}", "out": "{out}"}), Ingest.build({"log": "{source}", "out": "{out}"}),
+        Annotate.build({"scene": "{scene}", "out": "{out}"}), Fuse.build({"scene": "{scene}", "out": "{out}"}),
+        Fit.build({**scene, "out": "{out}"}, {"method": "street_gaussians"}),
+        Synthesize.build({**scene, "fitted": "{fit}", "out": "{out}"}),
+        RenderViews.build({"scene": "{scene}", "model": "{fit}", "out": "{out}"}),
+        Score.build({**scene, "views": {"fit": "{render}"}, "out": "{out}"}),
+    )  # fmt: skip
+    return {step.verb(): tuple(words_of(step)) for step in steps}
 
 
 class BatchProgress(Step):

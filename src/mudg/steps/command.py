@@ -8,7 +8,7 @@ import os
 import shutil
 import textwrap
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
@@ -147,6 +147,33 @@ def _value(kind: Any, value: Any) -> Any:
         choices = [choice for choice in get_args(kind) if get_origin(kind) is Literal and not isinstance(choice, str)]
         return next((choice for choice in choices if str(choice) == value), value)
     return value
+
+
+def words_of(step: Step) -> list[str]:
+    """The command line of a step behind ``mudg``, without its output and what has its default: `parse` makes the same step of it."""
+    cls, words, flags = type(step), step.verb().split(" "), list[str]()
+    own = {field.name: getattr(step, field.name) for field in dataclasses.fields(step) if field.name != "settings"}
+    for field in dataclasses.fields(step):
+        value = own.get(field.name)
+        if field.name in ("out", "settings") or value == field.default:
+            continue
+        if flag_of(cls, field.name).position in ("first", "rest"):
+            words += map(str, value) if isinstance(value, tuple) else [str(value)]
+        else:
+            flags += _flag_words(field.name, value)
+    if cls.settings_type() is not None:
+        usual = {one.name: one.default for one in options(cls, cls.settings_from(own, None, {})) if not one.own}
+        given = {one.name: one.default for one in options(cls, getattr(step, "settings")) if not one.own}  # noqa: B009
+        flags += [word for name, value in given.items() if value != usual[name] for word in _flag_words(name, value)]
+    return [*words, *flags]
+
+
+def _flag_words(name: str, value: Any) -> list[str]:
+    if isinstance(value, bool):
+        return [flag_name(name) if value else _negated(name)]
+    if isinstance(value, Mapping):
+        return [flag_name(name), *(f"{key}={inner}" for key, inner in value.items())]
+    return [flag_name(name), *(map(str, value) if isinstance(value, tuple | list) else [str(value)])]
 
 
 # help ------------------------------------------------------------------------------------------------------------------

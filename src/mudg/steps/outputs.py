@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from mudg.base.errors import UsageError
+from mudg.steps.command import words_of
 from mudg.steps.engine import Result
 from mudg.steps.step import Flag, positions
 
@@ -49,9 +50,9 @@ class Listed(Output):
         from mudg.stages.batches.listed import ListedRun, run_listed
         from mudg.stages.batches.plan import read_list
 
+        one = type(self).build({positions(type(self))[0]: "{source}", "out": self.out, "overwrite": self.overwrite})
         entries = read_list(self.list, self.of_a_line)
-        settings = self.settings_in_list()
-        return run_listed(ListedRun(self.verb(), settings, entries, self.out, self.jobs, self.overwrite, self.shard, self.list))
+        return run_listed(ListedRun(words_of(one), self.settings_in_list(), entries, self.out, self.jobs, self.shard, self.list))
 
     def settings_in_list(self) -> Any:
         """Settings of the steps over a list, several of which run at a time."""

@@ -31,11 +31,11 @@ class Score(Output):
     short = ("baseline", "lpips_weights", "fid_weights", "fvd_weights", "perceptual_views", "device")
     scene: Annotated[Path, SCENE]
     """Scene directory that the views belong to, or folder of mudg run."""
+    fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
+    """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     views: Annotated[Mapping[str, Path], Flag("NAME=FOLDER ...", "second", "views")]
     """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE
     without the flag."""
-    fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
-    """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     settings: ScoreConfig
 
     truth: Annotated[Path | None, Flag(hidden=True)] = None

@@ -40,20 +40,23 @@ class ListedRun:
     """A verb over a list.
 
     Args:
-        verb: its name. settings: of the verb. entries: the whole list. out: ROOT; ``ROOT/status.json`` (with a shard:
-            ``status-i-of-n.json``) tells the outcome. jobs: processes; 0 = as many as there are processors. They share the
-            processors. overwrite: replace results of other settings. shard_text: ``i/n`` or empty. listed: the list, where it is a
-            file.
+        words: its command line for a ``{source}``. settings: of the verb. entries: the whole list. out: ROOT; ``ROOT/status.json`` (with a
+            shard: ``status-i-of-n.json``) tells the outcome. jobs: processes; 0 = as many as there are processors. They share the
+            processors. shard_text: ``i/n`` or empty. listed: the list, where it is a file.
     """
 
-    verb: str
+    words: Sequence[str]
     settings: Any
     entries: list[Entry]
     out: Path
     jobs: int = 0
-    overwrite: bool = False
     shard_text: str = ""
     listed: Path | None = None
+
+    @property
+    def verb(self) -> str:
+        """The verb."""
+        return self.words[0]
 
 
 def run_listed(asked: ListedRun, plan: BatchPlan | None = None) -> dict[str, Any]:
@@ -80,7 +83,7 @@ def run_listed(asked: ListedRun, plan: BatchPlan | None = None) -> dict[str, Any
     threads = max(1, native.default_threads() // jobs)
     log.info(f"{asked.verb}: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
     folder = BatchFolder(Location.of(asked.out.absolute()))
-    plan = plan or listed_plan(asked.verb, configuration.to_dict(asked.settings), asked.overwrite)
+    plan = plan or listed_plan(asked.words, configuration.to_dict(asked.settings))
     before = {entry.name: _finished(asked.out / entry.name) for entry in entries}
     told: dict[str, Ended] = {}
     with log.task(asked.verb, len(entries)) as bar, tempfile.TemporaryDirectory() as scratch:

@@ -157,18 +157,6 @@ REVISION: Final = "revision"
 """Setting of a line that only changes the key: another content at the same address."""
 
 
-STAGES: Final[Mapping[str, str]] = {
-    "run": "run {source}",
-    "ingest": "ingest {source}",
-    "annotate": "annotate {scene}",
-    "fuse": "fuse {scene}",
-    "fit": "fit {scene} --fused {fuse} --method street_gaussians",
-    "synthesize": "synthesize {scene} --fused {fuse} --fitted {fit}",
-    "render": "render {scene} --model {fit}",
-    "score": "score {scene} --fused {fuse} --views fit={render}",
-}
-"""Words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}`` for that of annotate or ingest,
-or for the source."""
 _PLACEHOLDER: Final = re.compile(r"\{(\w+)\}")
 COMMAND: Final = "command"
 """Name of the step that is a program of the user's own."""
@@ -245,10 +233,14 @@ def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
     return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
 
 
-def plan_of(names: Sequence[str], settings: Mapping[str, Any], command: Sequence[str] = ()) -> BatchPlan:
+def plan_of(
+    names: Sequence[str], lines: Mapping[str, Sequence[str]], settings: Mapping[str, Any], command: Sequence[str] = ()
+) -> BatchPlan:
     """The plan of these steps.
 
     Args:
+        lines: words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}`` for that of
+            annotate or ingest, or for the source.
         settings: those of ``mudg run``, as JSON values. command: a program of the user's own, as the step ``command``.
 
     Raises:
@@ -259,16 +251,16 @@ def plan_of(names: Sequence[str], settings: Mapping[str, Any], command: Sequence
             names = (*names, COMMAND)
         if "{out}" not in " ".join(command):
             raise UsageError("a command must be told where to write", where="--command", expected="{out} among its words")
-    known = {**{name: words.split() for name, words in STAGES.items()}, **({COMMAND: list(command)} if command else {})}
+    known = {**lines, **({COMMAND: command} if command else {})}
     stages: list[BatchStage] = []
     for name in names:
         if name not in known:
-            raise UsageError("there is no such step", where="--stages", got=name, expected=", ".join(STAGES))
+            raise UsageError("there is no such step", where="--stages", got=name, expected=", ".join(lines))
         made = [stage.name for stage in stages]
         scene = next((one for one in ("annotate", "ingest") if one in made), "source")
         words = tuple(word if name == COMMAND else word.replace("{scene}", "{" + scene + "}") for word in known[name])
         read = set(_PLACEHOLDER.findall(" ".join(words)))
-        missing = (read & set(STAGES)) - set(made)
+        missing = (read & set(lines)) - set(made)
         if missing and name != COMMAND:
             raise UsageError(f"the step {name} needs {' and '.join(sorted(missing))} before it", where="--stages", got=" ".join(names))
         own = {} if name == COMMAND else dict(settings if name == "run" else settings[name])
@@ -278,10 +270,9 @@ def plan_of(names: Sequence[str], settings: Mapping[str, Any], command: Sequence
     return BatchPlan(tuple(stages))
 
 
-def listed_plan(verb: str, settings: Mapping[str, Any], overwrite: bool) -> BatchPlan:
-    """The plan of one verb over a list, whose results lie right below the output."""
-    words = (verb, "{source}", *(["--overwrite"] if overwrite else []))
-    return BatchPlan((BatchStage(verb, words, (), settings, direct=True),))
+def listed_plan(words: Sequence[str], settings: Mapping[str, Any]) -> BatchPlan:
+    """The plan of one step over a list, whose results lie right below the output."""
+    return BatchPlan((BatchStage(words[0], tuple(words), (), settings, direct=True),))
 
 
 def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:
