@@ -29,6 +29,7 @@ from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
 from mudg.stages import convert, fuse, synthesize
 from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
 from mudg.stages.learning import memory_plan
+from mudg.stages.learning.views import recorded_at_pose, recorded_images
 
 GOLDEN = Path(__file__).parent / "golden"
 TOLERANCE = 1e-4
@@ -473,15 +474,15 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
 
 def test_the_released_resizing(street):
     """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
-    from mudg.data.clips.condition import ConditionRules, build_conditions, project_sparse
+    from mudg.data.clips.condition import ConditionRules, build_conditions
     from mudg.data.cloudfile import read_fused
     from mudg.data.scene import read_scene
 
     scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
     view = scene.frames_of("front")[0].view
     native = ConditionRules(48, 32, published=True)
-    sparse = project_sparse(cloud, scene.tracks, view.resized(48, 32), native)
-    recorded = synthesize.recorded_images(scene, SynthesizeConfig(given_classes=False))
+    sparse = native.project(cloud, scene.tracks, view.resized(48, 32))
+    recorded = recorded_images(scene, SynthesizeConfig(given_classes=False))
     made, _ = build_conditions(cloud, scene.tracks, [view], recorded, ConditionRules(12, 8, 48, 32, published=True))
     assert torch.equal(made.color[0], (sparse.rgb * sparse.valid)[:, ::4, ::4])
     depth = sparse.depth * sparse.valid
@@ -495,13 +496,13 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     from mudg.data.scene import read_scene
 
     scene = read_scene(street / "scene")
-    recorded = synthesize.recorded_images(scene, SynthesizeConfig(given_classes=False))
+    recorded = recorded_images(scene, SynthesizeConfig(given_classes=False))
     view = recorded[0].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]
-    assert synthesize.recorded_at_pose(view, recorded)
-    assert not synthesize.recorded_at_pose(View(view.camera, moved, view.time_s), recorded)
-    assert not synthesize.recorded_at_pose(view, [])
+    assert recorded_at_pose(view, recorded)
+    assert not recorded_at_pose(View(view.camera, moved, view.time_s), recorded)
+    assert not recorded_at_pose(view, [])
 
 
 def test_short_trajectories_are_refused_in_words(street, tmp_path):

@@ -27,10 +27,10 @@ from mudg.base.processes import computed_ahead
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
+from mudg.core.project import ProjectConfig, project_sparse
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import visible_depth
 from mudg.data import scene as scenefile
-from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
 
 CPU = torch.device("cpu")
@@ -316,12 +316,12 @@ def load_virtual(
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
     """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are then.
 
-    Points behind others are left out as in the diffusion model's condition (``data.clips.project_sparse``).
+    Points behind others are left out as in the diffusion model's condition (``ConditionRules``).
     """
+    drawn = ProjectConfig(near_m=1.0, far_m=MAX_LIDAR_M, occluder_m=0.2)
 
     def measured(view: View) -> LidarPixels:
-        camera = view.camera
-        seen = project_sparse(cloud, tracks, view, ConditionRules(camera.width, camera.height, far_m=MAX_LIDAR_M))
+        seen = project_sparse(cloud, tracks, view, drawn, hide=True)
         pixel = seen.valid.reshape(-1).nonzero()[:, 0]
         return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
 
