@@ -19,7 +19,7 @@ from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.data.observations import read_observations
 from mudg.models.diffusion import SampleRequest
-from mudg.models.published import clip, files, video_unet
+from mudg.models.published import clip, files
 from mudg.models.published import model as published
 from mudg.models.published.clip import ImageTower, TextTower, TowerConfig
 from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
@@ -300,9 +300,9 @@ def test_every_input_of_the_network_matters(model):
 
 def test_many_sequences_are_attended_in_parts(monkeypatch):
     q, k, v = torch.randn(3, 13, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
-    whole = video_unet.attend(q, k, v, 2)
-    monkeypatch.setattr(video_unet, "MAX_ATTENTION_BATCH", 4)
-    assert torch.allclose(video_unet.attend(q, k, v, 2), whole, atol=1e-6)
+    whole = clip.attend(q, k, v, 2)
+    monkeypatch.setattr(clip, "MAX_ATTENTION_BATCH", 4)
+    assert torch.allclose(clip.attend(q, k, v, 2), whole, atol=1e-6)
 
 
 def test_other_numbers_of_frames_are_refused(model):

@@ -30,8 +30,8 @@ from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import ProjectConfig, project_sparse
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import visible_depth
-from mudg.data import scene as scenefile
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
+from mudg.data.scene import read_image, read_label, read_points
 
 CPU = torch.device("cpu")
 MAX_LIDAR_M = 100.0
@@ -213,7 +213,7 @@ def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, Obse
     found: set[int] = set()
     labelled = [frame for frame in frames if "semantics" in frame.labels]
     for frame in labelled[:: max(1, len(labelled) // 24)]:
-        found |= set(np.unique(scenefile.read_label(scene, frame, "semantics")).tolist())
+        found |= set(np.unique(read_label(scene, frame, "semantics")).tolist())
     for observations in virtual.values():
         for index in range(0, len(observations), 6):
             found |= set(np.unique(observations.arrays(index).get("semantics", UNLABELLED)).tolist())
@@ -239,14 +239,14 @@ def load_recorded(
         view = resized_view(frame.view, width_px)
         size = (view.camera.height, view.camera.width)
         labels = {
-            name: resize_nearest(scenefile.read_label(scene, frame, name), *size) if name in frame.labels else None
+            name: resize_nearest(read_label(scene, frame, name), *size) if name in frame.labels else None
             for name in ("semantics", "sky", "ego", "semantics_confidence")
         }
         confidence = labels["semantics_confidence"]
         semantics = labels["semantics"]
         sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
         return StoredView(
-            frame.id, view, "recorded", resize_area(scenefile.read_image(scene, frame), *size[::-1]),
+            frame.id, view, "recorded", resize_area(read_image(scene, frame), *size[::-1]),
             None if semantics is None or not classes else to_channels(semantics, classes), sky,
             None if labels["ego"] is None else ~labels["ego"].astype(bool), points.pixels_of(view) if with_lidar else None,
             confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
@@ -380,7 +380,7 @@ class _SweepCache:
         with self._lock:
             found = self._read.pop(sweep.id, None)
             if found is None:
-                points = scenefile.read_points(self._scene, sweep)
+                points = read_points(self._scene, sweep)
                 world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
                 found = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
             self._read[sweep.id] = found
