@@ -36,7 +36,7 @@ from mudg.stages.config import (
     bench_preset,
     run_preset,
 )
-from mudg.stages.synthesize import recorded_images
+from mudg.stages.learning.views import recorded_images
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 

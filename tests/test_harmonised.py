@@ -38,12 +38,13 @@ from mudg.models.mdm import files
 from mudg.models.mdm.codec import CodecConfig
 from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.models.published.model import PublishedMDM
-from mudg.stages import fit, synthesize
+from mudg.stages import fit
 from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
 from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
 from mudg.stages.editing.harmonised_weather import corrected
 from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.stages.editing.vacated import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
+from mudg.stages.learning.views import recorded_images
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
@@ -357,7 +358,7 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
         assert np.array_equal(image[~mask], read_image(old, recorded)[~mask])
         differ += int((image != read_image(other, rendered)).any(-1).sum())
     assert differ > 0
-    photos = synthesize.recorded_images(scene, SynthesizeConfig())
+    photos = recorded_images(scene, SynthesizeConfig())
     assert all(np.array_equal(~p.usable, read_label(scene, f, "rendered")) for p, f in zip(photos, scene.frames_in("train"), strict=True))
     config = fit_config(method="street_gaussians", iterations=4, start__gaussians=900, densify__max_gaussians=1500)
     again = Fit(
@@ -467,7 +468,7 @@ def test_weather_is_generated_by_a_published_type_model(run: Path, published: st
             assert torch.equal(one.rgb, new.rgb) == (path != "front_recorded" and number == 0)
             assert torch.equal(one.semantics, new.semantics)
     scene, cloud = read_scene(run / "scene"), read_fused(run / "fuse")
-    recorded = synthesize.recorded_images(scene, SynthesizeConfig())
+    recorded = recorded_images(scene, SynthesizeConfig())
     rules = ConditionRules(12, 8, 60, 40, published=True)
     clear = build_conditions(cloud, scene.tracks, given[0].views, recorded, rules)[0]
     seen = (clear.color[0].amax(0) > 0) & (clear.measured.depth[0, 0] > 8) & clear.measured.valid[0, 0]

@@ -26,10 +26,11 @@ from mudg.data.scene import read_scene
 from mudg.models.mdm.model import BatchPart, LossSettings
 from mudg.models.published import files as published_files
 from mudg.models.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
-from mudg.stages import convert, learn, synthesize
+from mudg.stages import convert, learn
 from mudg.stages.config import FuseConfig, LearnConfig, SynthesizeConfig
 from mudg.stages.learning import clips as learn_clips
 from mudg.stages.learning import models as learn_models
+from mudg.stages.learning.views import recorded_images
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn
 from mudg.steps.synthesize import Synthesize
@@ -237,7 +238,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     window = from_log.log_windows(log.scene, rules)[0]
     held = replace(window, held_out=True)  # all points are kept
     clip = from_log.make_clip(log, held, 0)
-    recorded = synthesize.recorded_images(log.scene, SynthesizeConfig(given_classes=False))
+    recorded = recorded_images(log.scene, SynthesizeConfig(given_classes=False))
     views = [log.frame(name).view for name in window.frames]
     conditions = ConditionRules(48, 32, 72, 48, published=True)
     wanted = build_conditions(log.cloud, log.scene.tracks, views, recorded, conditions)[0]

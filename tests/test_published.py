@@ -19,16 +19,17 @@ from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.data.observations import read_observations
 from mudg.models.diffusion import SampleRequest
-from mudg.models.published import clip, files, video_unet
+from mudg.models.published import clip, files
 from mudg.models.published import model as published
 from mudg.models.published.clip import ImageTower, TextTower, TowerConfig
 from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
 from mudg.models.published.model import PublishedConfig, WorkSplit
 from mudg.models.published.resampler import Resampler, ResamplerConfig
 from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
-from mudg.stages import convert, synthesize
+from mudg.stages import convert
 from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
 from mudg.stages.learning import memory_plan
+from mudg.stages.learning.views import recorded_at_pose, recorded_images
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize
 
@@ -301,9 +302,9 @@ def test_every_input_of_the_network_matters(model):
 
 def test_many_sequences_are_attended_in_parts(monkeypatch):
     q, k, v = torch.randn(3, 13, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
-    whole = video_unet.attend(q, k, v, 2)
-    monkeypatch.setattr(video_unet, "MAX_ATTENTION_BATCH", 4)
-    assert torch.allclose(video_unet.attend(q, k, v, 2), whole, atol=1e-6)
+    whole = clip.attend(q, k, v, 2)
+    monkeypatch.setattr(clip, "MAX_ATTENTION_BATCH", 4)
+    assert torch.allclose(clip.attend(q, k, v, 2), whole, atol=1e-6)
 
 
 def test_other_numbers_of_frames_are_refused(model):
@@ -477,15 +478,15 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
 
 def test_the_released_resizing(street):
     """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
-    from mudg.data.clips.condition import ConditionRules, build_conditions, project_sparse
+    from mudg.data.clips.condition import ConditionRules, build_conditions
     from mudg.data.cloudfile import read_fused
     from mudg.data.scene import read_scene
 
     scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
     view = scene.frames_of("front")[0].view
     native = ConditionRules(48, 32, published=True)
-    sparse = project_sparse(cloud, scene.tracks, view.resized(48, 32), native)
-    recorded = synthesize.recorded_images(scene, SynthesizeConfig(given_classes=False))
+    sparse = native.project(cloud, scene.tracks, view.resized(48, 32))
+    recorded = recorded_images(scene, SynthesizeConfig(given_classes=False))
     made, _ = build_conditions(cloud, scene.tracks, [view], recorded, ConditionRules(12, 8, 48, 32, published=True))
     assert torch.equal(made.color[0], (sparse.rgb * sparse.valid)[:, ::4, ::4])
     depth = sparse.depth * sparse.valid
@@ -499,13 +500,13 @@ def test_the_reference_fits_only_where_it_was_taken(street):
     from mudg.data.scene import read_scene
 
     scene = read_scene(street / "scene")
-    recorded = synthesize.recorded_images(scene, SynthesizeConfig(given_classes=False))
+    recorded = recorded_images(scene, SynthesizeConfig(given_classes=False))
     view = recorded[0].view
     moved = view.world_from_cam.copy()
     moved[:3, 3] += [0.0, 1.0, 0.0]
-    assert synthesize.recorded_at_pose(view, recorded)
-    assert not synthesize.recorded_at_pose(View(view.camera, moved, view.time_s), recorded)
-    assert not synthesize.recorded_at_pose(view, [])
+    assert recorded_at_pose(view, recorded)
+    assert not recorded_at_pose(View(view.camera, moved, view.time_s), recorded)
+    assert not recorded_at_pose(view, [])
 
 
 def test_short_trajectories_are_refused_in_words(street, tmp_path):

@@ -24,6 +24,7 @@ from mudg.stages import fit, synthesize
 from mudg.stages.config import FuseConfig, SynthesizeConfig
 from mudg.stages.fitting.planes import FAR_M, render_planes
 from mudg.stages.fitting.rendering import render_condition
+from mudg.stages.learning.views import PreparedImages, ViewMaker, add_detail, windows
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize
@@ -97,17 +98,17 @@ def test_every_frame_is_made(usual):
 
 def test_interruption_leaves_no_trace(world, usual, tmp_path, monkeypatch):
     whole = frames_of(usual / "front_shift+1.0")
-    make = synthesize.ViewMaker.make
+    make = ViewMaker.make
 
     def stop_in_second_window(self, views, number, known):
         if number == 1:
             raise KeyboardInterrupt
         return make(self, views, number, known)
 
-    monkeypatch.setattr(synthesize.ViewMaker, "make", stop_in_second_window)
+    monkeypatch.setattr(ViewMaker, "make", stop_in_second_window)
     with pytest.raises(KeyboardInterrupt):
         made(world, tmp_path / "parts")
-    monkeypatch.setattr(synthesize.ViewMaker, "make", make)
+    monkeypatch.setattr(ViewMaker, "make", make)
     with pytest.raises(InputError):
         read_observations(tmp_path / "parts" / "front_shift+1.0")
     parts = frames_of(made(world, tmp_path / "parts") / "front_shift+1.0")
@@ -140,7 +141,7 @@ def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world
 def test_prepared_images_are_kept_exactly():
     levels = torch.arange(256, dtype=torch.uint8).view(1, 16, 16).expand(3, -1, -1)
     flat, view = torch.ones(16, 16), View(Camera("front", 16, 16, 9.0, 9.0, 8.0, 8.0), np.eye(4), 0.0)
-    images = synthesize.PreparedImages()
+    images = PreparedImages()
     for number, rgb in enumerate((levels.float() / 255, levels.float() / 255 * 1.01 - 0.003)):
         images[number] = condition.WarpSource(view, rgb, flat, flat > 2, flat.byte())
         assert torch.equal(images[number].rgb, rgb)
@@ -177,7 +178,7 @@ def test_finished_result_is_reused(world, usual, monkeypatch):
 @pytest.mark.parametrize("frames", [1, 3, 8, 9, 13, 24, 199])
 @pytest.mark.parametrize("overlap", [0, 2, 7])
 def test_windows_cover_every_frame(frames, overlap):
-    spans = synthesize.windows(frames, 8, overlap)
+    spans = windows(frames, 8, overlap)
     assert spans[0].start == 0
     assert spans[-1].stop == frames
     assert sorted({i for span in spans for i in span}) == list(range(frames))
@@ -189,7 +190,7 @@ def test_windows_cover_every_frame(frames, overlap):
 
 def test_overlap_must_leave_something_new():
     with pytest.raises(UsageError):
-        synthesize.windows(20, 8, 8)
+        windows(20, 8, 8)
 
 
 def test_detail_is_given_back_where_the_sample_agrees(world):
@@ -201,10 +202,10 @@ def test_detail_is_given_back_where_the_sample_agrees(world):
         shape = (2, 1, *color.shape[-2:])
         return type("C", (), {"color": color, "valid": torch.ones(shape) > 0, "warped": torch.ones(shape) > 0})()
 
-    full = synthesize.add_detail(coarse, stand_in(coarse), stand_in(fine))
+    full = add_detail(coarse, stand_in(coarse), stand_in(fine))
     assert torch.allclose(full, fine, atol=1e-4)
     changed = (coarse + 0.5).clamp(0, 1)
-    other = synthesize.add_detail(changed, stand_in(coarse), stand_in(fine))
+    other = add_detail(changed, stand_in(coarse), stand_in(fine))
     enlarged = torch.nn.functional.interpolate(changed, size=(32, 48), mode="bicubic", align_corners=False).clamp(0, 1)
     moved = (changed - coarse).abs().amax(1, keepdim=True) > 0.12
     untouched = -torch.nn.functional.max_pool2d(-moved.float(), 5, stride=1, padding=2) > 0

@@ -36,12 +36,12 @@ from mudg.models.scene.hexplane import moving_rows as hexplane_moving
 from mudg.models.scene.initial import columns_from_points
 from mudg.models.scene.model import SceneModel, compose
 from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
-from mudg.models.scene.vibration import VibrationNode, average_velocity, born_later, moving_rows, starting_columns
+from mudg.models.scene.vibration import VibrationNode, average_velocity, moving_rows, starting_columns
 from mudg.stages import fit, fuse
 from mudg.stages.config import FuseConfig
 from mudg.stages.fitting import pvg
 from mudg.stages.fitting import views as fit_views
-from mudg.stages.fitting.recipes import RECIPES
+from mudg.stages.fitting.recipes import RECIPES, recipe_of
 from mudg.stages.radiance import loop as radiance_loop
 from mudg.stages.radiance import rays
 from mudg.steps.fit import Fit
@@ -136,11 +136,12 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
 def test_children_lie_on_their_parents_path():
     columns = {"means": torch.zeros(2, 3), "tau": torch.tensor([0.1, 0.1]), "log_beta": torch.tensor([0.04, 0.005]).log(),
                "velocity": torch.tensor([[3.0, 0, 0]] * 2)}  # fmt: skip
-    born = born_later(columns, torch.tensor([1.0, -2.0]), late=True)
+    node = VibrationNode.of_times([0.0, 0.1])
+    born = node.born_later(columns, torch.tensor([1.0, -2.0]), late=True)
     assert born["tau"].tolist() == pytest.approx([0.14, 0.09])
     assert born["means"][:, 0].tolist() == pytest.approx([3 * math.exp(-0.1) * 0.04, -3 * math.exp(-0.0125) * 0.01])
     assert born["log_beta"].exp().tolist() == pytest.approx([0.04 / 1.6, 0.005])
-    assert born_later(columns, torch.zeros(2), late=False)["log_beta"].tolist() == columns["log_beta"].tolist()
+    assert node.born_later(columns, torch.zeros(2), late=False)["log_beta"].tolist() == columns["log_beta"].tolist()
     assert moving_rows(columns).tolist() == [True, True]
     assert moving_rows(columns, 0.01).tolist() == [False, True]
 
@@ -527,7 +528,7 @@ def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_pat
 
 @pytest.mark.parametrize("method", RECIPES)
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
-    for weight in RECIPES[method].own_weights:
+    for weight in recipe_of(method).own_weights:
         with pytest.raises(UsageError, match="published weights of its own"):
             Fit(
                 scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, **{f"loss__{weight}": 0.33})

@@ -24,7 +24,7 @@ from mudg.stages.config import BenchConfig, SynthesizeConfig
 from mudg.stages.learning import score as learn_score
 from mudg.stages.learning.city_fits import fit_city
 from mudg.stages.learning.precision import choose_bf16
-from mudg.stages.synthesize import windows
+from mudg.stages.learning.views import windows
 
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 

@@ -22,8 +22,9 @@ from torch import Tensor
 
 from mudg import native
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import FusedCloud, PointCloud, View
-from mudg.core.visible import RULES
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import FusedCloud, PointCloud, Track, View
+from mudg.core.visible import RULES, seen_pixels
 from mudg.core.zbuffer import DrawLimits, PointLayer, draw_points, pointer
 
 _MAX_POINTS: Final = 2**31 - 1
@@ -166,3 +167,35 @@ def _paint(index: NDArray[np.int32], rgb: NDArray[np.uint8], first: int, color: 
         return
     mine = (index >= first) & (index < first + len(rgb))
     color[:, mine] = (rgb[index[mine] - first].astype(np.float32) / np.float32(255)).T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectedPoints:
+    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
+    semantics u8[H,W] (255 = unknown)."""
+
+    rgb: Tensor
+    depth: Tensor
+    valid: Tensor
+    moving: Tensor
+    semantics: Tensor
+
+
+def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, config: ProjectConfig, *, hide: bool) -> ProjectedPoints:
+    """Project a fused cloud into a view, its objects where they are at that time.
+
+    Args:
+        hide: leave points out that shine through gaps between nearer ones (`core.visible`, rule `condition`).
+    """
+    poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
+    placed = {name: pose for name, pose in poses.items() if pose is not None}
+    seen = project_cloud(cloud, placed, view, config)
+    valid = seen.valid[0]
+    if hide:
+        valid = torch.from_numpy(seen_pixels(seen.depth[0].numpy(), valid.numpy(), RULES["condition"]))
+    clouds = [cloud.static, *(points for _, points in drawn_objects(cloud, placed))]
+    unknown = np.uint8(UNLABELLED)
+    ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
+    table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
+    moving = (seen.index >= len(cloud.static)) & valid
+    return ProjectedPoints(seen.color, seen.depth[0], valid, moving, table[seen.index.long()])

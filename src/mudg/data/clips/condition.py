@@ -36,9 +36,7 @@ from mudg.base.errors import InputError
 from mudg.base.renders import RenderPlanes
 from mudg.base.types import Condition, FusedCloud, Photo, SparseDepth, Track, View
 from mudg.core.pictures import resize_area, to_bytes
-from mudg.core.project import ProjectConfig, drawn_objects, project_cloud
-from mudg.core.visible import RULES as HIDING_RULES
-from mudg.core.visible import seen_pixels
+from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
 from mudg.data.clips.stacked import KeptImages, stacked
 from mudg.data.clips.vacated import Vacated, VacatedAt, continued, determined, ground_behind, uncertain_there
 
@@ -90,17 +88,13 @@ class ConditionRules:
     (`Condition.measured`).
     """
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProjectedPoints:
-    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
-    semantics u8[H,W] (255 = unknown)."""
-
-    rgb: Tensor
-    depth: Tensor
-    valid: Tensor
-    moving: Tensor
-    semantics: Tensor
+    def project(self, cloud: FusedCloud, tracks: Sequence[Track], view: View) -> ProjectedPoints:
+        """The cloud's points in a view of the condition's resolution."""
+        drawn = ProjectConfig(
+            static_splat_px=self.point_px, object_splat_px=self.point_px, near_m=self.near_m, far_m=self.far_m,
+            occluder_m=0.0 if self.published else self.occluder_m,
+        )  # fmt: skip
+        return project_sparse(cloud, tracks, view, drawn, hide=not self.published)
 
 
 OVERLAP_GRID = 24, 16
@@ -145,7 +139,7 @@ class DrawnCloud:
         a recorded image shows in the same direction (255 = unknown), are something else: there a surface stands that no image
         shows, and the nearest measured pixel stands for it, in the render too.
         """
-        sparse = project_sparse(self.cloud, self.tracks, view, self.rules)
+        sparse = self.rules.project(self.cloud, self.tracks, view)
         nearest = _nearest_measured(sparse)
         color, depth, moving, ids = _filled(sparse, nearest, self.rules)
         vacated = None if self.vacated_at is None else self.vacated_at(view)
@@ -505,7 +499,7 @@ def _published_condition(
     own = (rules.width, rules.height)
     native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     seen = views if native == own else [view.resized(*native) for view in views]
-    sparse = [project_sparse(cloud, tracks, view, rules) for view in seen]
+    sparse = [rules.project(cloud, tracks, view) for view in seen]
     valid = torch.stack([s.valid for s in sparse])[:, None]
     colors = [s.rgb if recolor is None else recolor.points(view, s) for view, s in zip(seen, sparse, strict=True)]
     color = torch.stack(colors) * valid
@@ -525,7 +519,7 @@ def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View],
     """
     own, seen = (rules.width, rules.height), replace(rules, published=False)
     grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
-    points = [project_sparse(cloud, tracks, view if grid == own else view.resized(*grid), seen) for view in views]
+    points = [seen.project(cloud, tracks, view if grid == own else view.resized(*grid)) for view in views]
     whole = SparseDepth(*(torch.stack([getattr(p, name) for p in points])[:, None] for name in ("depth", "valid")))
     return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
 
@@ -608,23 +602,3 @@ def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
         return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)
     own = torch.from_numpy(recorded.semantics.astype(np.uint8))
     return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]
-
-
-def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, rules: ConditionRules) -> ProjectedPoints:
-    """Project a fused cloud into a view of the condition's resolution (see `ProjectedPoints`)."""
-    poses = {track.id: track.pose_at(view.time_s) for track in tracks if track.id in cloud.objects}
-    config = ProjectConfig(
-        static_splat_px=rules.point_px, object_splat_px=rules.point_px, near_m=rules.near_m, far_m=rules.far_m,
-        occluder_m=0.0 if rules.published else rules.occluder_m,
-    )  # fmt: skip
-    placed = {name: pose for name, pose in poses.items() if pose is not None}
-    seen = project_cloud(cloud, placed, view, config)
-    valid = seen.valid[0]
-    if not rules.published:
-        valid = torch.from_numpy(seen_pixels(seen.depth[0].numpy(), valid.numpy(), HIDING_RULES["condition"]))
-    clouds = [cloud.static, *(points for _, points in drawn_objects(cloud, placed))]
-    unknown = np.uint8(palette.UNLABELLED)
-    ids = [np.full(len(c), unknown) if c.semantics is None else c.semantics for c in clouds]
-    table = torch.from_numpy(np.append(np.concatenate(ids), unknown))  # index -1 finds the appended one
-    moving = (seen.index >= len(cloud.static)) & valid
-    return ProjectedPoints(seen.color, seen.depth[0], valid, moving, table[seen.index.long()])

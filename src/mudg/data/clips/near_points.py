@@ -20,7 +20,7 @@ from mudg.base import palette
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.types import Condition, FusedCloud, Track, View
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
-from mudg.data.clips.condition import ConditionRules, project_sparse
+from mudg.data.clips.condition import ConditionRules
 
 NEAR_FRAMES: Final = 2
 """Points of so many frames before and after a view are shown."""
@@ -71,7 +71,7 @@ def near_condition(sweeps: NearSweeps, views: Sequence[View], rules: ConditionRu
     """
     small = tuple(view.resized(rules.width, rules.height) for view in views)
     bare = replace(rules, published=True, point_px=1.0)
-    seen = [project_sparse(sweeps.cloud_at(view.time_s + late_s), sweeps.tracks, view, bare) for view in small]
+    seen = [bare.project(sweeps.cloud_at(view.time_s + late_s), sweeps.tracks, view) for view in small]
     valid = torch.stack([s.valid for s in seen])[:, None]
     shown = [sweeps.colors.image_of(v.camera.name, s.rgb).clamp(0, 1) if sweeps.colors.to_common else s.rgb for v, s in zip(small, seen)]
     color = torch.stack(shown) * valid

@@ -15,8 +15,9 @@ from mudg.base import palette
 from mudg.base.types import View
 from mudg.base.weather_settings import Conditions
 from mudg.core import weather
+from mudg.core.project import ProjectedPoints
 from mudg.core.weather import DriveFacts, ShownView
-from mudg.data.clips.condition import ProjectedPoints, RenderAt
+from mudg.data.clips.condition import RenderAt
 
 SKY: Final = palette.ID["sky"]
 

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import palette
+from mudg.base import palette, records, shards, store
 from mudg.base.errors import UsageError
 
 Modality = Literal["rgb", "depth", "semantics"]
 MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "semantics")
 CLASSES = len(palette.CLASSES)
+SHIPPED = Path(__file__).resolve().parents[2] / "assets" / "mdm_small"
+"""Folder of the diffusion model whose codec stands for all shipped ones."""
 
 
 @dataclass(frozen=True)
@@ -224,3 +227,12 @@ def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
         counts.scatter_add_(1, cells[:, place : place + 1], torch.ones_like(counts[:, :1]))
     share = counts[:, :CLASSES]
     return (share / share.sum(1, keepdim=True).clamp(min=1.0)).reshape(*lead, CLASSES, *cells.shape[-2:])
+
+
+def shipped_codec() -> PatchCodec:
+    """The codec of the shipped diffusion model."""
+    content, prefix = store.read_json(SHIPPED / "model.json"), "codec."
+    codec = PatchCodec(records.parse_dataclass(CodecConfig, content["config"]["codec"], "codec: "))
+    state = shards.read_shards(SHIPPED, content["files"])
+    codec.load_state_dict({name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)})
+    return codec.eval()

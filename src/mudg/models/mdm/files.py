@@ -16,11 +16,11 @@ import torch
 
 from mudg.base import records, shards, store
 from mudg.base.errors import InputError
+from mudg.models.mdm.codec import SHIPPED
 from mudg.models.mdm.model import MDM, MDMConfig
 
 MODEL_FILE = "model.json"
-_ASSETS = Path(__file__).resolve().parents[2] / "assets"
-EMBEDDED: dict[str, Path] = {"embedded": _ASSETS / "mdm_small", "embedded-tiny": _ASSETS / "mdm_tiny"}
+EMBEDDED: dict[str, Path] = {"embedded": SHIPPED, "embedded-tiny": SHIPPED.with_name("mdm_tiny")}
 """Models that come with the package, by the names that stand for their folders."""
 SHARD_BYTES = 15 * 1024 * 1024
 

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mudg.base.errors import UsageError
-from mudg.models.published.video_unet import attend
 
 CAPTION = "A photo a of driving scene."
 """The caption of every training clip; its word order is part of what the model knows."""
@@ -26,6 +25,19 @@ EMPTY_IDS = (49406, 49407)
 """Token ids of the published caption and of the empty one."""
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 """Statistics of the colours in 0..1 that CLIP's image towers were trained with."""
+MAX_ATTENTION_BATCH = 32768
+"""Attention over more sequences than this is done in parts: GPU kernels have a limit of 65535."""
+
+
+def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
+    """Softmax attention of `query` [N,L,C] over `key`, `value` [N,M,C] with C split into `heads` -> [N,L,C]."""
+    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (query, key, value))
+    if len(q) > MAX_ATTENTION_BATCH:
+        parts = zip(*(x.split(MAX_ATTENTION_BATCH) for x in (q, k, v)))
+        mixed = torch.cat([functional.scaled_dot_product_attention(*part) for part in parts])
+    else:
+        mixed = functional.scaled_dot_product_attention(q, k, v)
+    return mixed.transpose(1, 2).flatten(2)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mudg.models.published.video_unet import attend
+from mudg.models.published.clip import attend
 
 
 @dataclass(frozen=True)

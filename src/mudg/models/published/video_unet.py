@@ -24,10 +24,9 @@ from torch.utils.checkpoint import checkpoint
 
 from mudg.base.errors import UsageError
 from mudg.models.mdm.network import sinusoid
+from mudg.models.published.clip import attend
 
 GROUPS = 32
-MAX_ATTENTION_BATCH = 32768
-"""Attention over more sequences than this is done in parts: GPU kernels have a limit of 65535."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +81,6 @@ class SeededDropout(nn.Module):
             torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
         ]
         return x * (torch.cat(draws) >= self.share).to(x) / (1 - self.share)
-
-
-def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
-    """Softmax attention of `query` [N,L,C] over `key`, `value` [N,M,C] with C split into `heads` -> [N,L,C]."""
-    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (query, key, value))
-    if len(q) > MAX_ATTENTION_BATCH:
-        parts = zip(*(x.split(MAX_ATTENTION_BATCH) for x in (q, k, v)))
-        mixed = torch.cat([functional.scaled_dot_product_attention(*part) for part in parts])
-    else:
-        mixed = functional.scaled_dot_product_attention(q, k, v)
-    return mixed.transpose(1, 2).flatten(2)
 
 
 class Context(NamedTuple):

@@ -26,7 +26,6 @@ from mudg.core.quaternions import rotate
 from mudg.core.table import Table
 from mudg.models.scene.model import SceneModel
 from mudg.models.scene.nodes import RigidNode
-from mudg.models.scene.vibration import SHORT_BETA, born_later
 
 SPLIT_SHRINK = 1.6
 """Both halves of a split Gaussian are this much smaller (published value)."""
@@ -147,8 +146,9 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     grow = _rows_to_grow(model, stats, settings)
     large = model.table["log_scales"].detach().amax(1).exp() > settings.split_above_m
     if stats.time is not None:
+        world = model.nodes[0]
         hurried = stats.time / stats.seen.clamp_min(1) >= settings.time_gradient
-        large |= hurried & (model.table["log_beta"].detach().exp() > SHORT_BETA)
+        large |= hurried & (model.table["log_beta"].detach().exp() > world.short_life)
     split_rows = (grow & large).nonzero()[:, 0]
     clone_rows = (grow & ~large).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool, device=model.device)
@@ -210,7 +210,7 @@ def _halves(
 ) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
     """Two smaller Gaussians drawn from each split one (centres sampled from its own density, times of those that have a life span
     too; of these three, late)."""
-    halves, timed = [], "tau" in model.table.columns
+    halves, timed, world = [], "tau" in model.table.columns, model.nodes[0]
     late = timed and 0 < settings.late <= step
     for half in range(3 if late else 2):
         columns, labels = copied_rows(model.table, rows)
@@ -221,7 +221,7 @@ def _halves(
         columns["log_scales"] = columns["log_scales"] - torch.log(torch.tensor(SPLIT_SHRINK))
         if timed:
             drawn = torch.randn(len(rows), generator=seeds.torch_generator(run_seed, step, f"split time {half}"))
-            columns = born_later(columns, drawn.to(rows.device), late)
+            columns = world.born_later(columns, drawn.to(rows.device), late)
         halves.append((columns, labels))
     return halves
 

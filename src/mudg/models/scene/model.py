@@ -19,6 +19,7 @@ Label columns: ``node`` i32[N], the index into ``SceneModel.nodes``; of a finish
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -34,18 +35,21 @@ from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
 from mudg.core.table import Table
-from mudg.models.scene.bezier import BezierNode
-from mudg.models.scene.deformed import DeformationField, DeformedNode
-from mudg.models.scene.hexplane import HexPlaneNode
-from mudg.models.scene.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
+from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
 from mudg.models.scene.sky import SkyNode
-from mudg.models.scene.vibration import VibrationNode
 
-NODES: Final[dict[str, Any]] = {
-    "static": StaticNode, "rigid": RigidNode, "deformable": DeformableNode, "sky": SkyNode, "vibration": VibrationNode,
-    "deformed": DeformedNode, "deformation": DeformationField, "hexplane": HexPlaneNode,
-    "bezier": BezierNode,
-}  # fmt: skip
+NODES: Final[Mapping[str, str]] = {
+    "static": "mudg.models.scene.nodes:StaticNode",
+    "rigid": "mudg.models.scene.nodes:RigidNode",
+    "deformable": "mudg.models.scene.nodes:DeformableNode",
+    "sky": "mudg.models.scene.sky:SkyNode",
+    "vibration": "mudg.models.scene.vibration:VibrationNode",
+    "deformed": "mudg.models.scene.deformed:DeformedNode",
+    "deformation": "mudg.models.scene.deformed:DeformationField",
+    "hexplane": "mudg.models.scene.hexplane:HexPlaneNode",
+    "bezier": "mudg.models.scene.bezier:BezierNode",
+}
+"""Where the class of every kind of node is; those of published methods are imported when a scene has them."""
 COLUMNS: Final = frozenset({"means", "quats", "log_scales", "logits", "sh_dc", "sh_rest", "semantics"})
 """Columns that every scene may have; others belong to a kind of node (``NodeRows.own``)."""
 CERTAINTY: Final = "certainty"
@@ -194,7 +198,7 @@ class SceneModel:
             own = {
                 key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")
             }
-            node = NODES[facts["kind"]].from_state(facts, own)
+            node = pkgutil.resolve_name(NODES[facts["kind"]]).from_state(facts, own)
             if isinstance(node, SkyNode):
                 sky = node
             else:

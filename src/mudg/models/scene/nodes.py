@@ -12,7 +12,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Self
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 import torch
@@ -68,6 +68,8 @@ class StaticNode:
     """Rows already in the world. Other kinds of node have the same methods, and an optimisable table of their own if they need one."""
 
     kind = "static"
+    short_life: ClassVar[float] = 0.0
+    """Life span (column ``log_beta``) above which densification splits a Gaussian in time, below which it copies it."""
 
     def __init__(self, name: str = "background") -> None:
         self.name = name
@@ -75,6 +77,10 @@ class StaticNode:
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
         """The rows as they are at a time, differentiable in all they hold; None: the node does not exist then."""
         return rows
+
+    def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
+        """Children of split rows in time; Gaussians without a life span are there at all times."""
+        return dict(columns)
 
     def parameters(self) -> Table | None:
         """The node's own optimisable table beside the shared one, or None."""

@@ -30,8 +30,6 @@ CYCLE: Final = 0.2
 LEAST_FACTOR: Final = 0.05
 SHRINK: Final = 1.6
 """The life span of children of a late split is this much shorter."""
-SHORT_BETA: Final = 0.01
-"""Life span above which a Gaussian is split in time, below which it is copied."""
 
 
 class VibrationNode(StaticNode):
@@ -45,6 +43,7 @@ class VibrationNode(StaticNode):
     """
 
     kind = "vibration"
+    short_life = 0.01
 
     def __init__(self, name: str, middle_s: float, frame_s: float, early: float = 0.0) -> None:
         super().__init__(name)
@@ -78,6 +77,19 @@ class VibrationNode(StaticNode):
             means = means + average_velocity(velocity, beta) * self.early
         return replace(rows, means=means, opacity=rows.opacity * factor * (factor > LEAST_FACTOR))
 
+    def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
+        """Children of split rows: each at another time of its parent's life, where the parent would be then.
+
+        Args:
+            noise: standard normal ``[n]``.
+            late: whether the life span shrinks too (the second half of densification).
+        """
+        beta = columns["log_beta"].exp()
+        later = beta * noise
+        moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]
+        shorter = math.log(SHRINK) * (beta >= self.short_life) if late else torch.zeros_like(beta)
+        return {**columns, "means": moved, "tau": columns["tau"] + later, "log_beta": columns["log_beta"] - shorter}
+
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``StaticNode``."""
         return {"name": self.name, "middle_s": self.middle_s, "frame_s": self.frame_s}, {}
@@ -97,20 +109,6 @@ def starting_columns(count: int, tau: Tensor, duration: float) -> dict[str, Tens
     """Columns of Gaussians that have not learnt to move: ``tau`` [count] and ``duration`` in units of time."""
     beta = math.sqrt(0.1 * max(duration, FRAME))
     return {"tau": tau.float(), "log_beta": torch.full((count,), math.log(beta)), "velocity": torch.zeros(count, 3)}
-
-
-def born_later(columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
-    """Children of split rows: each at another time of its parent's life, where the parent would be then.
-
-    Args:
-        noise: standard normal ``[n]``.
-        late: whether the life span shrinks too (the second half of densification).
-    """
-    beta = columns["log_beta"].exp()
-    later = beta * noise
-    moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]
-    shorter = math.log(SHRINK) * (beta >= SHORT_BETA) if late else torch.zeros_like(beta)
-    return {**columns, "means": moved, "tau": columns["tau"] + later, "log_beta": columns["log_beta"] - shorter}
 
 
 def moving_rows(columns: Mapping[str, Tensor], least_beta: float = 0.2) -> Tensor:

@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mudg.stages.config.adapt import AdaptConfig
+    from mudg.stages.config.annotate import AnnotateConfig
     from mudg.stages.config.batch import BatchConfig
-    from mudg.stages.config.bench import BenchConfig, BenchOwn
+    from mudg.stages.config.bench import BenchConfig, BenchOwn, bench_preset
     from mudg.stages.config.convert import ConvertConfig
     from mudg.stages.config.edit import EditConfig
     from mudg.stages.config.export import ExportConfig, ImportConfig
     from mudg.stages.config.fit import FitConfig
+    from mudg.stages.config.fuse import FuseConfig
     from mudg.stages.config.harmonize import HarmonizeConfig
+    from mudg.stages.config.ingest import IngestConfig
     from mudg.stages.config.learn import LearnConfig
-    from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
-    from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, bench_preset, chosen_preset, run_preset
+    from mudg.stages.config.presets import DEMO_CITY, PRESETS, PresetName, chosen_preset, run_preset
     from mudg.stages.config.run import RunConfig, on_device, with_device, with_lines, with_seed
     from mudg.stages.config.synthesize import SynthesizeConfig
     from mudg.stages.config.view import PageConfig, ViewConfig
@@ -37,14 +39,14 @@ _HOMES = {
     "HarmonizeConfig": "mudg.stages.config.harmonize",
     "LearnConfig": "mudg.stages.config.learn",
     "AdaptConfig": "mudg.stages.config.adapt",
-    "AnnotateConfig": "mudg.stages.config.prepare",
-    "FuseConfig": "mudg.stages.config.prepare",
+    "AnnotateConfig": "mudg.stages.config.annotate",
+    "FuseConfig": "mudg.stages.config.fuse",
     "ImportConfig": "mudg.stages.config.export",
-    "IngestConfig": "mudg.stages.config.prepare",
+    "IngestConfig": "mudg.stages.config.ingest",
     "DEMO_CITY": "mudg.stages.config.presets",
     "PRESETS": "mudg.stages.config.presets",
     "PresetName": "mudg.stages.config.presets",
-    "bench_preset": "mudg.stages.config.presets",
+    "bench_preset": "mudg.stages.config.bench",
     "chosen_preset": "mudg.stages.config.presets",
     "RunConfig": "mudg.stages.config.run",
     "run_preset": "mudg.stages.config.presets",

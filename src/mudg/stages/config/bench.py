@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from pydantic import Field
@@ -10,7 +11,8 @@ from pydantic.dataclasses import dataclass
 from mudg.base.config import STRICT
 from mudg.base.devices import DeviceName
 from mudg.stages.config.fit import FitConfig
-from mudg.stages.config.prepare import FuseConfig
+from mudg.stages.config.fuse import FuseConfig
+from mudg.stages.config.presets import PresetName, run_preset
 from mudg.stages.config.synthesize import SynthesizeConfig
 from mudg.stages.config.views import ScoreConfig
 
@@ -107,3 +109,18 @@ class BenchConfig(BenchOwn):
     """shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
     score: ScoreConfig = Field(default_factory=ScoreConfig)
     """paper: how every row is scored; files of weights are given here."""
+
+
+def bench_preset(name: PresetName = "default") -> BenchConfig:
+    """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say how clouds, views
+    and fits are made. Which logs, and their size, is the benchmark's matter.
+
+    Raises:
+        UsageError: no such preset.
+    """
+    run = run_preset(name)
+    return BenchConfig(
+        model=run.synthesize.model, iterations=run.fit.iterations, continue_fit=run.continue_fit, fuse=run.fuse,
+        synthesize=replace(run.synthesize, model=SynthesizeConfig().model, cameras=SynthesizeConfig().cameras),
+        fit=replace(run.fit, iterations=FitConfig().iterations),
+    )  # fmt: skip

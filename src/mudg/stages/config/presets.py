@@ -10,10 +10,7 @@ from dataclasses import replace
 from typing import Any, Final, Literal, get_args
 
 from mudg.base.errors import UsageError
-from mudg.stages.config.bench import BenchConfig
-from mudg.stages.config.fit import FitConfig
 from mudg.stages.config.run import RunConfig, with_lines
-from mudg.stages.config.synthesize import SynthesizeConfig
 
 PresetName = Literal["fast", "default", "quality", "paper"]
 
@@ -73,21 +70,6 @@ def run_preset(name: PresetName = "default") -> RunConfig:
         raise UsageError("no such preset", where="--preset", expected=", ".join(get_args(PresetName)), got=repr(name))
     config = _with(with_lines(RunConfig(), cameras=()), {"ingest.city.seed": DEMO_CITY})
     return _with(config, PRESETS[name])
-
-
-def bench_preset(name: PresetName = "default") -> BenchConfig:
-    """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say how clouds, views
-    and fits are made. Which logs, and their size, is the benchmark's matter.
-
-    Raises:
-        UsageError: no such preset.
-    """
-    run = run_preset(name)
-    return BenchConfig(
-        model=run.synthesize.model, iterations=run.fit.iterations, continue_fit=run.continue_fit, fuse=run.fuse,
-        synthesize=replace(run.synthesize, model=SynthesizeConfig().model, cameras=SynthesizeConfig().cameras),
-        fit=replace(run.fit, iterations=FitConfig().iterations),
-    )  # fmt: skip
 
 
 def chosen_preset(name: PresetName | None, fast: bool) -> PresetName:

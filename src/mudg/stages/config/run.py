@@ -11,8 +11,10 @@ from pydantic.dataclasses import dataclass
 from mudg.base.config import STRICT
 from mudg.base.devices import DeviceName
 from mudg.stages.config.adapt import AdaptConfig
+from mudg.stages.config.annotate import AnnotateConfig
 from mudg.stages.config.fit import FitConfig
-from mudg.stages.config.prepare import AnnotateConfig, FuseConfig, IngestConfig
+from mudg.stages.config.fuse import FuseConfig
+from mudg.stages.config.ingest import IngestConfig
 from mudg.stages.config.synthesize import SynthesizeConfig
 from mudg.stages.config.views import RenderConfig, ScoreConfig
 

@@ -52,7 +52,7 @@ from mudg.stages.editing.written import EditedImages
 from mudg.stages.fitting.planes import FAR_M, render_planes
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.learning import loading
-from mudg.stages.synthesize import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_images, windows
+from mudg.stages.learning.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_images, windows
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
 GROWN_PX: Final = 2

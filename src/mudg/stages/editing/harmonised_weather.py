@@ -28,7 +28,7 @@ from mudg.stages.editing.harmonised import PUBLISHED_OVERLAP, DrawPair, EditedSo
 from mudg.stages.editing.vacated import vacated_at
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.learning import loading
-from mudg.stages.synthesize import EDITED_IMAGES_PER_VIEW, recorded_at_pose, windows
+from mudg.stages.learning.views import EDITED_IMAGES_PER_VIEW, recorded_at_pose, windows
 
 
 def harmonises_weather(config: HarmonizeConfig, how: InWeather) -> bool:

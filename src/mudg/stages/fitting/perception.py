@@ -13,7 +13,7 @@ from mudg.core import losses
 from mudg.core.perceptual import lpips_distance, unit_features
 from mudg.data.weights import read_checkpoint
 from mudg.models.featnets import CodecFeatures, FilterBank, LpipsFeatures, LpipsInput, LpipsTrunk
-from mudg.models.mdm import files as mdm_files
+from mudg.models.mdm.codec import shipped_codec
 from mudg.stages.config.fit import VirtualConfig
 
 Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -29,8 +29,7 @@ def perception_of(config: VirtualConfig, device: torch.device | None = None) -> 
     if config.perception == "filters":
         return _compared(FilterBank().to(device), losses.feature_distance)
     if config.perception == "codec":
-        codec = mdm_files.load("embedded").codec
-        return _compared(CodecFeatures(codec.requires_grad_(False)).to(device), _lpips())
+        return _compared(CodecFeatures(shipped_codec().requires_grad_(False)).to(device), _lpips())
     if not config.lpips_weights:
         raise UsageError("LPIPS needs a weight file", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
     trunk = lpips_network(config.lpips_weights).to(device)

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Mapping
 from typing import Final
 
-from mudg.stages.fitting.bezier import BezierRecipe
-from mudg.stages.fitting.difix import RepairRecipe
-from mudg.stages.fitting.omnire import OmniRecipe
-from mudg.stages.fitting.pvg import VibrationRecipe
-from mudg.stages.fitting.recipe import Recipe, StaticRecipe
-from mudg.stages.fitting.s3gaussian import FieldRecipe
+from mudg.stages.fitting.recipe import Recipe
 
-RECIPES: Final[Mapping[str, Recipe]] = {
-    "gs3d": StaticRecipe(),
-    "bezier": BezierRecipe(),
-    "omnire": OmniRecipe(),
-    "pvg": VibrationRecipe(),
-    "s3gaussian": FieldRecipe(),
+RECIPES: Final[Mapping[str, str]] = {
+    "gs3d": "mudg.stages.fitting.recipe:StaticRecipe",
+    "bezier": "mudg.stages.fitting.bezier:BezierRecipe",
+    "omnire": "mudg.stages.fitting.omnire:OmniRecipe",
+    "pvg": "mudg.stages.fitting.pvg:VibrationRecipe",
+    "s3gaussian": "mudg.stages.fitting.s3gaussian:FieldRecipe",
 }
-"""Of published methods that are fitted to recorded views alone."""
-SUPERVISED: Final[Mapping[str, Recipe]] = {"difix": RepairRecipe()}
-COMMON: Final = Recipe()
+"""Of published methods that are fitted to recorded views alone: where their class is, imported when it is needed."""
+SUPERVISED: Final[Mapping[str, str]] = {"difix": "mudg.stages.fitting.difix:RepairRecipe"}
 
 
 def recipe_of(method: str) -> Recipe:
     """What a method does beyond the common loop."""
-    return RECIPES.get(method) or SUPERVISED.get(method, COMMON)
+    home = RECIPES.get(method) or SUPERVISED.get(method)
+    return Recipe() if home is None else pkgutil.resolve_name(home)()

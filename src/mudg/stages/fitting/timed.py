@@ -21,7 +21,7 @@ from mudg.base.types import Scene
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import visible_depth
-from mudg.data import scene as scenefile
+from mudg.data.scene import read_points
 from mudg.models.scene.initial import neighbour_scale, voxel_filter
 from mudg.stages.config import FitConfig
 from mudg.stages.fitting.start import StartPoints, fill_unreached, thinned
@@ -91,7 +91,7 @@ def _measured(
                 nearest.setdefault(heads[index].view.camera.name, index)
         if not nearest:
             continue
-        points = scenefile.read_points(scene, sweep)
+        points = read_points(scene, sweep)
         xyz, gap = geometry.transform_points(sweep.world_from_lidar, points.xyz), largest_beam_gap(points.xyz)
         free = np.ones(len(xyz), bool)
         for index in nearest.values():

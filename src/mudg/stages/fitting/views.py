@@ -27,11 +27,11 @@ from mudg.base.processes import computed_ahead
 from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.pictures import resize_area, resize_nearest
+from mudg.core.project import ProjectConfig, project_sparse
 from mudg.core.visible import RULES as HIDING_RULES
 from mudg.core.visible import visible_depth
-from mudg.data import scene as scenefile
-from mudg.data.clips.condition import ConditionRules, project_sparse
 from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
+from mudg.data.scene import read_image, read_label, read_points
 
 CPU = torch.device("cpu")
 MAX_LIDAR_M = 100.0
@@ -213,7 +213,7 @@ def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, Obse
     found: set[int] = set()
     labelled = [frame for frame in frames if "semantics" in frame.labels]
     for frame in labelled[:: max(1, len(labelled) // 24)]:
-        found |= set(np.unique(scenefile.read_label(scene, frame, "semantics")).tolist())
+        found |= set(np.unique(read_label(scene, frame, "semantics")).tolist())
     for observations in virtual.values():
         for index in range(0, len(observations), 6):
             found |= set(np.unique(observations.arrays(index).get("semantics", UNLABELLED)).tolist())
@@ -239,14 +239,14 @@ def load_recorded(
         view = resized_view(frame.view, width_px)
         size = (view.camera.height, view.camera.width)
         labels = {
-            name: resize_nearest(scenefile.read_label(scene, frame, name), *size) if name in frame.labels else None
+            name: resize_nearest(read_label(scene, frame, name), *size) if name in frame.labels else None
             for name in ("semantics", "sky", "ego", "semantics_confidence")
         }
         confidence = labels["semantics_confidence"]
         semantics = labels["semantics"]
         sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
         return StoredView(
-            frame.id, view, "recorded", resize_area(scenefile.read_image(scene, frame), *size[::-1]),
+            frame.id, view, "recorded", resize_area(read_image(scene, frame), *size[::-1]),
             None if semantics is None or not classes else to_channels(semantics, classes), sky,
             None if labels["ego"] is None else ~labels["ego"].astype(bool), points.pixels_of(view) if with_lidar else None,
             confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
@@ -316,12 +316,12 @@ def load_virtual(
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
     """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are then.
 
-    Points behind others are left out as in the diffusion model's condition (``data.clips.project_sparse``).
+    Points behind others are left out as in the diffusion model's condition (``ConditionRules``).
     """
+    drawn = ProjectConfig(near_m=1.0, far_m=MAX_LIDAR_M, occluder_m=0.2)
 
     def measured(view: View) -> LidarPixels:
-        camera = view.camera
-        seen = project_sparse(cloud, tracks, view, ConditionRules(camera.width, camera.height, far_m=MAX_LIDAR_M))
+        seen = project_sparse(cloud, tracks, view, drawn, hide=True)
         pixel = seen.valid.reshape(-1).nonzero()[:, 0]
         return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
 
@@ -380,7 +380,7 @@ class _SweepCache:
         with self._lock:
             found = self._read.pop(sweep.id, None)
             if found is None:
-                points = scenefile.read_points(self._scene, sweep)
+                points = read_points(self._scene, sweep)
                 world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
                 found = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
             self._read[sweep.id] = found

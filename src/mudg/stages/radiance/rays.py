@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mudg.base import geometry, log, seeds
 from mudg.base.types import Frame, Scene, View
-from mudg.data import scene as scenefile
+from mudg.data.scene import read_points
 from mudg.models.radiance.field import Extent
 from mudg.models.radiance.march import Rays
 from mudg.stages.fitting.views import StoredView, load_recorded
@@ -49,7 +49,7 @@ def lidar_rays(scene: Scene) -> LidarRays | None:
     share = 1.0
     parts: list[tuple[np.ndarray, ...]] = []
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "reading LiDAR rays"):
-        points = scenefile.read_points(scene, sweep)
+        points = read_points(scene, sweep)
         share = min(share, MOST_LIDAR_RAYS / max(1, len(points.xyz) * len(scene.sweeps)))
         kept = slice(None, None, max(1, round(1 / share)))
         world = geometry.transform_points(sweep.world_from_lidar, points.xyz[kept]).astype(np.float64)
