@@ -533,7 +533,7 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
-    small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch", "hexplane__space": 4}
+    small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
     here = fit.run(settings(method, device="cpu", **small), world["scene"], world["fuse"], tmp_path / "here")
     with pretend_device():
         there = fit.run(settings(method, device="pretend", **small), world["scene"], world["fuse"], tmp_path / "there")

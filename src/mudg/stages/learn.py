@@ -65,6 +65,9 @@ _OUTPUT = VerbOutput(
      "loss.png", "metrics.json", "model/*", "model.part/"),
 )  # fmt: skip
 
+WEIGHT_DECAY = 0.01
+"""Of AdamW, as published."""
+
 
 def run(config: LearnConfig, out: Path, *, overwrite: bool = False) -> Path:
     """Train a model, from nothing or from an earlier one; returns the folder of the exported model (`OUT/model`).
@@ -235,7 +238,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
     rules = config.optimizer
     optimizer = torch.optim.AdamW(
-        [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=rules.weight_decay,
+        [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=WEIGHT_DECAY,
         fused=True,
     )  # fmt: skip
     average = None

@@ -22,7 +22,7 @@ class RenderViews(Output):
     )
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
-    short = ("cameras", "shifts_m", "paths", "width_px", "video", "fps", "remove_tracks", "device", "harmonize.on", "harmonize.model")
+    short = ("cameras", "shifts_m", "paths", "width_px", "video", "remove_tracks", "device", "harmonize.on", "harmonize.model")
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None
