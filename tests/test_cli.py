@@ -36,11 +36,11 @@ def call(monkeypatch: pytest.MonkeyPatch, outcome: object, *words: str) -> int:
 
 def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> None:
     file = tmp_path / "settings.yaml"
-    file.write_text("fit:\n  iterations: 77\n  start: {voxel_m: 0.3, far_m: 90}\n")
+    file.write_text("fit:\n  iterations: 77\n  start: {voxel_m: 0.3, gaussians: 90}\n")
     args = parse("demo", "--fast", "--config", str(file), "--fit.start.voxel-m", "0.25")
     assert args.settings.fit.iterations == 77
     assert args.settings.fit.start.voxel_m == 0.25
-    assert args.settings.fit.start.far_m == 90
+    assert args.settings.fit.start.gaussians == 90
     fast, full = stage_config.run_preset("fast"), stage_config.run_preset()
     assert args.settings.synthesize == fast.synthesize != full.synthesize
     assert args.settings.ingest == fast.ingest

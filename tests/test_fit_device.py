@@ -114,7 +114,7 @@ def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -
 
 CASES = {
     "gradient": ("street_gaussians", {"sh_degree": 1, "poses__learn": True, "poses__start": 0.3, "poses__rounds": 2}),
-    "everything": ("mudg_s", {**EVERYTHING, "densify__kind": "gradient", "virtual__densify": True}),
+    "everything": ("mudg_s", {**EVERYTHING, "densify__kind": "gradient"}),
     "mcmc": ("mudg_s", {"densify__kind": "mcmc", "appearance__exposure": "camera"}),
 }
 

@@ -40,6 +40,7 @@ from mudg.models.mdm.model import MDM, MDMConfig
 from mudg.models.published.model import PublishedMDM
 from mudg.stages import fit
 from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
+from mudg.stages.editing import harmonised
 from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
 from mudg.stages.editing.harmonised_weather import corrected
 from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
@@ -198,7 +199,7 @@ def test_pasting_changes_nothing_outside_of_the_mask() -> None:
     one, two = (observed(torch.rand(3, 32, 48, generator=generator), ids.roll(n)) for n in (0, 1))
     mask = np.zeros((32, 48), bool)
     mask[8:20, 10:30] = True
-    weight = soft_edge(mask, 3)
+    weight = soft_edge(mask)
     assert not bool(weight[~torch.from_numpy(mask)].any()) and float(weight.max()) == 1.0
     assert bool((weight[14, 10:14].diff() > 0).all()) and float(weight[14, 10]) == pytest.approx(0.25)
     made = pasted(one, two, weight)
@@ -295,10 +296,19 @@ def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "bad").exists()
 
 
-def test_renders_are_repaired_where_the_edit_touches_them(run: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def unguarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The render is kept nowhere, whatever the model shows: these models were not trained."""
+    monkeypatch.setattr(harmonised, "guarded", lambda touched, *_: touched.any)
+
+
+def test_renders_are_repaired_where_the_edit_touches_them(
+    run: Path, tmp_path: Path, unguarded: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(harmonised, "FEATHER_PX", 0)
     edits, fitted = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians"
     config = RenderConfig(shifts_m=(0.0,), video=False)
-    repaired = replace(config, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, keep_classes=False, feather_px=0))
+    repaired = replace(config, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2))
     with pytest.raises(UsageError, match="--fused"):
         RenderViews(scene=run / "scene", model=fitted, edits=edits, out=tmp_path / "none", settings=repaired).run()
     before, physical, made = (
@@ -344,9 +354,9 @@ def test_a_correction_keeps_the_detail_of_the_render() -> None:
 
 
 @pytest.mark.slow
-def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Path) -> None:
+def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Path, unguarded: None) -> None:
     """Its images say which pixels were not recorded; warps leave these out; a fit goes on with the run's own fit."""
-    harmonize = HarmonizeConfig(on=True, model=str(run / "model"), steps=1, keep_classes=False)
+    harmonize = HarmonizeConfig(on=True, model=str(run / "model"), steps=1)
     edits = script(tmp_path, "- remove: {ids: [car]}")
     out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=EditConfig(harmonize=harmonize)).run()
     plain = Edit(source=run, script=edits, out=tmp_path / "plain", settings=EditConfig()).run()
@@ -491,7 +501,9 @@ def test_views_are_generated_in_weather_by_a_published_type_model(run: Path, pub
         Synthesize(scene=folders[0], fused=folders[1], fitted=fitted, out=tmp_path / "other", settings=config).run()
 
 
-def test_a_removed_car_is_repaired_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch) -> None:
+def test_a_removed_car_is_repaired_by_a_published_type_model(
+    run: Path, published: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unguarded: None
+) -> None:
     """Only what the edit touched changes."""
     edits, fitted = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians"
     given = watched(monkeypatch)
@@ -504,7 +516,7 @@ def test_a_removed_car_is_repaired_by_a_published_type_model(run: Path, publishe
         ).run())
 
     before = rendered("plain", HarmonizeConfig())
-    made = rendered("made", HarmonizeConfig(on=True, model=published, steps=1, keep_classes=False))
+    made = rendered("made", HarmonizeConfig(on=True, model=published, steps=1))
     assert len(given) == 1
     changed = [(a.rgb != b.rgb).any(0) for a, b in zip(before, made, strict=True)]
     assert any(bool(mask.any()) for mask in changed)

@@ -25,7 +25,6 @@ from mudg.models.radiance import sampling
 from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggregated
 from mudg.models.radiance.march import Budget, RayDraws, Rays
 from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
-from mudg.stages.config.radiance import RadianceConfig
 from mudg.stages.radiance import loop
 from mudg.stages.radiance.pictures import flow_colors
 from mudg.stages.radiance.rays import extent_of, lidar_rays, view_rays
@@ -193,9 +192,8 @@ def test_schedules():
     assert loop.rate_share(1, 1000) == pytest.approx(0.01)
     assert loop.rate_share(200, 1000) == 1.0
     assert loop.rate_share(1000, 1000) == pytest.approx(0.33**4)
-    assert [loop.sight_width(step, 1000, RadianceConfig()) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
+    assert [loop.sight_width(step, 1000) for step in (80, 81, 290, 900)] == [0.0, 6.0, 3.0, 0.6]
     assert [loop.dynamic_share(step, 1000) for step in (1, 100, 300, 500, 900)] == pytest.approx([0, 0, 0.5, 1, 1])
-    assert loop.loss_weights(RadianceConfig(), 0.5).dynamic == pytest.approx(0.001)
 
 
 def _camera(width: int, height: int):

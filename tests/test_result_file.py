@@ -45,7 +45,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "mcap": ("a.mcap", "export mcap TOY/scene --quiet --out OUT", "--overwrite"),
     "asset": ("a.safetensors", "asset export TOY/fit car-1 --quiet --out OUT", "--scene TOY/scene"),
     "import": ("a.safetensors", "asset import TOY/van.ply --quiet --out OUT", "--length-m 4"),
-    "page": ("a.html", "page TOY/fit --scene TOY/scene --quiet --out OUT --images 0", "--lidar-points 0"),
+    "page": ("a.html", "page TOY/fit --scene TOY/scene --quiet --out OUT --images 0", "--budget 9"),
     "report": ("a.html", "report --quiet --out OUT TOY/run", "TOY/other_run"),
 }
 """Name of the output, a command, and words that make another result of it."""

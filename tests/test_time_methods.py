@@ -544,7 +544,7 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
-    small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch", "hexplane__space": 4}
+    small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
     here = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "here", settings=settings(method, device="cpu", **small)).run()
     with pretend_device():
         there = Fit(

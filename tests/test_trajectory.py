@@ -92,15 +92,6 @@ def test_a_banked_road_shifts_horizontally():
     assert move.tolist() == pytest.approx([0.0, 2.0, 0.0])
 
 
-def test_height_and_yaw():
-    scene = circle()
-    old, new = trajectory.recorded(scene, "front").views[3], trajectory.shifted(scene, "front", 0.0, height_m=0.5, yaw_rad=0.3).views[3]
-    assert (new.center_world - old.center_world).tolist() == pytest.approx([0, 0, 0.5])
-    forward_old, forward_new = old.world_from_cam[:3, 2], new.world_from_cam[:3, 2]
-    turned = math.atan2(forward_new[1], forward_new[0]) - math.atan2(forward_old[1], forward_old[0])
-    assert turned == pytest.approx(0.3, abs=1e-9)
-
-
 def test_names_and_origin():
     scene = circle(3)
     assert trajectory.recorded(scene, "front").name == "front_recorded"
@@ -130,11 +121,11 @@ def test_no_ego_pose_at_a_frame():
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.floats(-10, 10), st.floats(-3, 3), st.floats(-1, 1))
-def test_shifting_there_and_back_returns(shift_m, height_m, yaw_rad):
+@given(st.floats(-10, 10), st.floats(-1, 1))
+def test_shifting_there_and_back_returns(shift_m, yaw_rad):
     scene = drive([geometry.yaw_matrix(yaw_rad, (1.0, 2.0, 0.0))])
-    there = trajectory.shifted(scene, "front", shift_m, height_m=height_m).views[0].center_world
-    back = trajectory.shifted(scene, "front", -shift_m, height_m=-height_m).views[0].center_world
+    there = trajectory.shifted(scene, "front", shift_m).views[0].center_world
+    back = trajectory.shifted(scene, "front", -shift_m).views[0].center_world
     start = trajectory.recorded(scene, "front").views[0].center_world
     assert np.abs((there + back) / 2 - start).max() < 1e-9
 
@@ -177,13 +168,6 @@ def test_a_lane_change_and_a_faster_drive_follow_the_axes_of_the_first_frame():
         for number, (old, new) in enumerate(zip(before, path.views, strict=True)):
             assert np.allclose(new.center_world - old.center_world, np.multiply(number, direction), atol=1e-12)
             assert np.array_equal(new.world_from_cam[:3, :3], old.world_from_cam[:3, :3]) and new.time_s == old.time_s
-
-
-def test_a_raised_drive_is_that_of_a_vertical_shift():
-    scene = circle()
-    raised, shifted = trajectory.named(scene, "front", "up+1.5"), trajectory.shifted(scene, "front", 0.0, height_m=1.5)
-    for a, b in zip(raised.views, shifted.views, strict=True):
-        assert np.allclose(a.world_from_cam, b.world_from_cam)
 
 
 @pytest.mark.parametrize("name", ["", "up", "up1", "lane+", "lane+1e3", "shift+2", "up+1.", "up+1 "])

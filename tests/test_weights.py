@@ -214,10 +214,9 @@ def test_the_files_rescale_wins(tmp_path):
     assert model.config.schedule.base_scale == pytest.approx(0.35)
 
 
-def test_rescale_stays_exact_in_half_precision(tmp_path, complete):
-    model = converted(
-        tmp_path, {"state_dict": complete}, ConvertConfig(resolution="320x512", dtype="bfloat16", shard_mb=1)
-    )
+def test_rescale_stays_exact_in_half_precision(tmp_path, complete, monkeypatch):
+    monkeypatch.setattr(convert, "SHARD_BYTES", 1 << 20)
+    model = converted(tmp_path, {"state_dict": complete}, ConvertConfig(resolution="320x512", dtype="bfloat16"))
     assert model.dtype == torch.bfloat16
     assert torch.equal(model.schedule.scale, scale_table()[:1000])
     again = published_files.load(tmp_path / "out", dtype=torch.float16)

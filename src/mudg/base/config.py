@@ -2,7 +2,8 @@
 
 Settings that were taken out are listed in their class: the class variable ``RETIRED`` maps each name to the setting before which it
 stood ("" = last) and to the only value that results may have been made with. That value still stands in ``to_dict``, so a result's key
-stays what it was, and files may hold it. Any other value is refused.
+stays what it was, and files may hold it. Any other value is refused. The class variable ``FIXED`` maps a group to
+those of its fields that are no settings: they have their defaults, as if they were taken out.
 """
 
 from __future__ import annotations
@@ -41,17 +42,26 @@ def _with_retired(config: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     return whole | {old: former for old, (follower, former) in retired.items() if not follower}
 
 
-def _without_retired(config_type: Any, values: Mapping[str, Any], where: str, path: str = "") -> dict[str, Any]:
-    """Settings without those of ``RETIRED``; UsageError for one with another value than results may have."""
-    known, retired, rest = _types_of_fields(config_type), getattr(config_type, "RETIRED", {}), dict[str, Any]()
+def _without_retired(
+    config_type: Any, values: Mapping[str, Any], where: str, path: str = "", fixed: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Settings without those of ``RETIRED`` and ``fixed``; UsageError for one with another value than results may have."""
+    known, rest = _types_of_fields(config_type), dict[str, Any]()
+    retired = getattr(config_type, "RETIRED", {}) | {name: ("", getattr(config_type(), name)) for name in fixed}
     for name, value in values.items():
         if name not in retired:
             group = dataclasses.is_dataclass(known.get(name)) and isinstance(value, Mapping)
-            rest[name] = _without_retired(known[name], value, where, f"{path}{name}.") if group else value
+            inside = fixed_of(config_type, name)
+            rest[name] = _without_retired(known[name], value, where, f"{path}{name}.", inside) if group else value
         elif (former := retired[name][1]) != (list(value) if isinstance(value, tuple) else value):
             raise UsageError(f"the setting {path}{name} was removed", where=where, expected=f"nothing, or {former!r}", got=repr(value),
                              remedy="leave it out")  # fmt: skip
     return rest
+
+
+def fixed_of(config_type: Any, group: str) -> Sequence[str]:
+    """Fields of a group that are no settings."""
+    return getattr(config_type, "FIXED", {}).get(group, ())
 
 
 def result_settings(config: Any) -> dict[str, Any]:
@@ -150,9 +160,9 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _merge(
-    base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = ""
+    base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = "", fixed: Sequence[str] = ()
 ) -> dict[str, Any]:
-    known = _types_of_fields(config_type)
+    known = {name: kind for name, kind in _types_of_fields(config_type).items() if name not in fixed}
     merged = dict(base)
     for name, value in new.items():
         group = known.get(name)
@@ -170,7 +180,7 @@ def _merge(
                 )
             raise UsageError(what, where=where, expected=expected, remedy=remedy)
         if is_group and is_mapping and isinstance(base.get(name), Mapping):
-            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.")
+            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.", fixed_of(config_type, name))
         else:
             merged[name] = value
     return merged

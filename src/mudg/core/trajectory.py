@@ -1,4 +1,4 @@
-"""Camera paths: the recorded one, the same drive shifted sideways, raised or turned, and drives that leave it bit by bit.
+"""Camera paths: the recorded one, the same drive shifted sideways or raised, and drives that leave it bit by bit.
 
 Which left is used
 ------------------
@@ -56,49 +56,35 @@ def recorded(scene: Scene, camera: str) -> Trajectory:
     return Trajectory(trajectory_name(camera), tuple(views), "recorded")
 
 
-def shifted(scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0) -> Trajectory:
-    """The drive of one camera with the vehicle moved sideways; camera orientation kept (up to ``yaw_rad``).
+def shifted(scene: Scene, camera: str, shift_m: float) -> Trajectory:
+    """The drive of one camera with the vehicle moved sideways; camera orientation kept.
 
     Args:
         scene: the log; its ego path gives the left direction at each frame's time.
         camera: camera name, any mounting direction.
         shift_m: signed distance, positive to the left of the direction of travel (see the module's docstring).
-        height_m: added to world z.
-        yaw_rad: rotation of the camera about the vertical through its own centre, counter-clockwise from above.
 
     Returns:
         Trajectory of origin "shifted" with one view per recorded frame. Each camera centre moves by exactly
-        ``hypot(shift_m, height_m)``.
+        ``shift_m``.
 
     Raises:
         UsageError: unknown camera or a number that is not finite. InputError: no ego pose at a frame's time.
     """
-    for name, value in (("shift_m", shift_m), ("height_m", height_m), ("yaw_rad", yaw_rad)):
-        if not np.isfinite(value):
-            raise UsageError(f"{name} must be a finite number", got=str(value))
+    if not np.isfinite(shift_m):
+        raise UsageError("shift_m must be a finite number", got=str(shift_m))
     views = []
     for view in recorded(scene, camera).views:
         left = ego_left_world(_ego_pose(scene.ego, view))
         world_from_cam = np.array(view.world_from_cam, np.float64)
-        if yaw_rad:
-            world_from_cam[:3, :3] = geometry.yaw_matrix(yaw_rad)[:3, :3] @ world_from_cam[:3, :3]
-        world_from_cam[:3, 3] += shift_m * left + height_m * WORLD_UP
+        world_from_cam[:3, 3] += shift_m * left
         views.append(View(view.camera, world_from_cam, view.time_s))
-    name = trajectory_name(camera, shift_m)
-    if height_m:
-        name += f"_up{height_m:+.1f}"
-    if yaw_rad:
-        name += f"_yaw{np.degrees(yaw_rad):+.0f}"
-    return Trajectory(name, tuple(views), "shifted")
+    return Trajectory(trajectory_name(camera, shift_m), tuple(views), "shifted")
 
 
-def at_shift(
-    scene: Scene, camera: str, shift_m: float, *, height_m: float = 0.0, yaw_rad: float = 0.0
-) -> Trajectory:
+def at_shift(scene: Scene, camera: str, shift_m: float) -> Trajectory:
     """The recorded trajectory where nothing is shifted, else ``shifted``."""
-    if not shift_m and not height_m and not yaw_rad:
-        return recorded(scene, camera)
-    return shifted(scene, camera, shift_m, height_m=height_m, yaw_rad=yaw_rad)
+    return shifted(scene, camera, shift_m) if shift_m else recorded(scene, camera)
 
 
 def named(scene: Scene, camera: str, name: str) -> Trajectory:

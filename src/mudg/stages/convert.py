@@ -35,6 +35,8 @@ from mudg.stages.scoring.converted import convert_weights
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
 DTYPES = {"keep": None, "float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+SHARD_BYTES = 2**30
+"""Largest size of one weight file."""
 LICENCE = (
     "Weights keep the terms of those who published them; read the page they came from before any use. The code of MuDG and of "
     "DynamiCrafter is Apache-2.0; the data they were trained on have licences of their own (the Waymo Open Dataset is for "
@@ -134,8 +136,8 @@ def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, i
         raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(folder),
                          remedy="leave them out, or give a checkpoint file")  # fmt: skip
     files = depthlab.find(folder).files()
-    dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
-    return functools.partial(depthlab.convert_folder, folder, to, dtype, shard_bytes), memory_limit(config, *files)
+    dtype = DTYPES[config.dtype]
+    return functools.partial(depthlab.convert_folder, folder, to, dtype, SHARD_BYTES), memory_limit(config, *files)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
@@ -162,7 +164,7 @@ def memory_limit(config: ConvertConfig, *files: Path) -> int:
     if config.memory_gb:
         return int(config.memory_gb * 1e9)
     read = sum(path.stat().st_size * (1 if zipfile.is_zipfile(path) else 2) for path in files)
-    return read + 2 * config.shard_mb * (1 << 20) + 3 * processes.GIB
+    return read + 2 * SHARD_BYTES + 3 * processes.GIB
 
 
 def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig) -> None:
@@ -182,8 +184,8 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
         "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
     }  # fmt: skip
-    dtype, shard_bytes = DTYPES[config.dtype], config.shard_mb << 20
-    published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=shard_bytes)
+    dtype = DTYPES[config.dtype]
+    published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
 
 
 def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:

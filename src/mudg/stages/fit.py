@@ -356,8 +356,7 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
     config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
     recorded = view.kind == "recorded"
     model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
-    feeds_densify = recorded or config.virtual.densify
-    growing = feeds_densify and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
+    growing = recorded and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
     with_classes = not recorded or step % config.loss.semantic_every == 0
     gaussians = compose(model, view.view.time_s, with_classes)
     pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None

@@ -77,6 +77,9 @@ def check(config: LearnConfig) -> LearnConfig:
     learn_clips.is_streamed(config)  # refuses what does not go together
     return config
 
+WEIGHT_DECAY = 0.01
+"""Of AdamW, as published."""
+
 
 def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callable[[], RunDir]) -> None:
     """Train a model, from nothing or from an earlier one, and export it to `OUT/model`.
@@ -229,7 +232,7 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
     rules = config.optimizer
     optimizer = torch.optim.AdamW(
-        [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=rules.weight_decay,
+        [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=WEIGHT_DECAY,
         fused=True,
     )  # fmt: skip
     average = None

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing
@@ -49,6 +48,7 @@ from mudg.stages.radiance.storage import load_field
 VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
 """Bytes per pixel that drawing a view needs at least: colour, depth, coverage and shares of the classes."""
 AHEAD_PIXELS: Final = 1_000_000
+VIDEO_FPS: Final = 10.0
 """Larger views are drawn one at a time by all threads: less memory."""
 Drawers = Callable[[Sequence[View]], AbstractContextManager[Iterator[Observation]]]
 """Draws views in order."""
@@ -113,7 +113,7 @@ def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited |
                 follower.follow(path)
             _render_trajectory(_several(draw, threads), path, out / path.name, source, bar)
             if config.video:
-                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4", config.fps))
+                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4", VIDEO_FPS))
         for video in videos:
             video.result()
     return {"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)}
@@ -197,10 +197,9 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if not config.shifts_m and not config.paths:
         raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
-    moved = {"height_m": config.height_m, "yaw_rad": math.radians(config.yaw_deg)}
     paths = []
     for camera in cameras:
-        found = [trajectory.at_shift(scene, camera, shift_m, **moved) for shift_m in config.shifts_m]
+        found = [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
         for path in (*found, *(trajectory.named(scene, camera, name) for name in config.paths)):
             paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
     return tuple(paths)

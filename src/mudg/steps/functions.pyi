@@ -197,7 +197,6 @@ def convert(
     resolution: Literal['auto', '320x512', '576x1024'] = 'auto',
     dtype: Literal['keep', 'float32', 'float16', 'bfloat16'] = 'keep',
     towers: str = '',
-    shard_mb: int = 1024,
     memory_gb: float = 0.0,
 ) -> Any:
     """Convert a published checkpoint to a folder for synthesize, annotate or score.
@@ -211,7 +210,6 @@ def convert(
         resolution: Image height x width that the checkpoint was trained at. auto: from 512 or 1024 in the file's name.
         dtype: Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights.
         towers: OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own).
-        shard_mb: Largest size of one weight file, in MB.
         memory_gb: Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 = derived from the file's size). Raise it if the conversion runs out of memory.
     """
     ...
@@ -280,8 +278,6 @@ def edit(
     scene: str | Path | None = None,
     fused: str | Path | None = None,
     config: str | Path | None = None,
-    changed_above: float = 0.01568627450980392,
-    grow_px: int = 2,
     harmonize: Mapping[str, Any] = ...,
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
     device: str = 'auto',
@@ -296,8 +292,6 @@ def edit(
         scene: Scene directory that a Gaussian scene was fitted to. With it, the vehicle's path and parked objects can be edited. A run has its own.
         fused: Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its own.
         config: YAML file of settings, read before those given here.
-        changed_above: Images of an edited run keep the recorded pixels where renders with and without the edits differ by less than this, 0 to 1.
-        grow_px: The rest is grown by this many pixels, and comes from the render of the edited scene.
         harmonize: Of a whole run: let the diffusion model repair what the edits touch in its images.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
@@ -381,7 +375,6 @@ def fit(
     start: Mapping[str, Any] = ...,
     densify: Mapping[str, Any] = ...,
     objects: Mapping[str, Any] = ...,
-    hexplane: Mapping[str, Any] = ...,
     poses: Mapping[str, Any] = ...,
     appearance: Mapping[str, Any] = ...,
     drawing: Mapping[str, Any] = ...,
@@ -413,7 +406,6 @@ def fit(
         start:
         densify:
         objects:
-        hexplane:
         poses:
         appearance:
         drawing:
@@ -592,9 +584,7 @@ def page(
     method: str = '',
     budget: int = 3000000,
     memory_mb: int = 0,
-    image_width_px: int = 320,
     images: int = 150,
-    lidar_points: int = 20000,
 ) -> Any:
     """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network.
 
@@ -608,9 +598,7 @@ def page(
         method: Fit of a run to show (empty = the best one: mudg_s, else street_gaussians).
         budget: Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and faintest are left out.
         memory_mb: Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit). Gaussians are left out as for the budget.
-        image_width_px: Width of recorded images on the page, pixels (0 = none).
         images: Most recorded images on the page, taken evenly.
-        lidar_points: Most LiDAR points on the page, taken evenly from all sweeps.
     """
     ...
 
@@ -626,12 +614,9 @@ def render(
     cameras: tuple[str, ...] = ('front',),
     shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0),
     paths: tuple[str, ...] = (),
-    height_m: float = 0.0,
-    yaw_deg: float = 0.0,
     width_px: int = 0,
     remove_tracks: tuple[str, ...] = (),
     video: bool = True,
-    fps: float = 10.0,
     harmonize: Mapping[str, Any] = ...,
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
     device: str = 'auto',
@@ -649,12 +634,9 @@ def render(
         cameras: Cameras to render (empty = the first camera). A name that the scene lacks is an error.
         shifts_m: Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path.
         paths: Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower.
-        height_m: Vertical shift in metres, positive upwards; applies to every shift.
-        yaw_deg: Yaw in degrees, counter-clockwise seen from above; applies to every shift.
         width_px: Image width in pixels (0 = as recorded); the height follows.
         remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
         video: Also write one MP4 video per trajectory.
-        fps: Frames per second of the videos.
         harmonize: With an edit script: let the diffusion model repair what the edits touch.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
@@ -802,7 +784,6 @@ def synthesize(
     eta: float | None = None,
     condition: Literal['full', 'reference', 'points', 'concat', 'freevs', 'repair'] = 'full',
     given_classes: bool = True,
-    label_confidence: float = 0.5,
     align_depth: bool = True,
     overlap: int = 2,
     width_px: int = 0,
@@ -836,7 +817,6 @@ def synthesize(
         eta: Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given: 1).
         condition: Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. freevs: the condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair: renders of `--fitted` and the nearest recorded image, without points; gives colour alone.
         given_classes: Use the classes of labelled points and recorded images in the model's condition, if the scene has labels.
-        label_confidence: Labels of recorded images with a confidence below this, 0 to 1, are not used.
         align_depth: Align generated depth to the LiDAR points in the same view (one scale and one shift per frame).
         overlap: Frames that a window of the model shares with the previous window; they are kept, so that the video continues smoothly. Published-type models: 8.
         width_px: Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect ratio).

@@ -27,7 +27,7 @@ class RenderViews(Output):
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
     version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES))
-    short = ("cameras", "shifts_m", "paths", "width_px", "video", "fps", "remove_tracks", "device", "harmonize.on", "harmonize.model")
+    short = ("cameras", "shifts_m", "paths", "width_px", "video", "remove_tracks", "device", "harmonize.on", "harmonize.model")
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None

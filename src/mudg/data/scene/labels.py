@@ -19,6 +19,8 @@ from mudg.data.scene.schema import LABEL_NAMES, MAX_IMAGE_SIDE_PX
 _PNG_LABELS: Final = ("semantics", "sky", "ego", "dynamic", "rendered")
 """Kept as PNG, the rest as safetensors; all but the first are masks."""
 _CLASS_IDS: Final = (*range(19), palette.UNLABELLED)
+TRUSTED_LABELS: Final = 0.5
+"""Labels with less confidence than this are given to no model."""
 
 
 def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
@@ -54,7 +56,7 @@ def photographs(scene: Scene) -> tuple[Frame, ...]:
     return tuple(frame for frame in scene.frames_in("train") if "rendered" not in frame.labels)
 
 
-def read_trusted_classes(scene: Scene, frame: Frame, least: float) -> NDArray[np.uint8] | None:
+def read_trusted_classes(scene: Scene, frame: Frame, least: float = TRUSTED_LABELS) -> NDArray[np.uint8] | None:
     """Class ids u8[H, W] of a frame, 255 where unlabelled or where their confidence is below ``least``; None without labels."""
     if "semantics" not in frame.labels:
         return None

@@ -28,6 +28,8 @@ from mudg.pages.viewer.packed import Sections, key_rows
 WEBP_QUALITY: Final = 50
 REACH_M: Final = 80.0
 MOST_CELLS: Final = 4_000_000
+MOST_POINTS: Final = 20_000
+"""LiDAR points on a page, taken evenly from all sweeps."""
 LEAST_STEP_M: Final = 5e-4
 """Of heights of the ground; ten times that of LiDAR points."""
 UNKNOWN: Final = 65535
@@ -52,12 +54,12 @@ def begin_of(scene: Scene) -> float:
     return min(frame.view.time_s for frame in scene.frames)
 
 
-def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images: int, most_points: int) -> PageFacts:
+def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images: int) -> PageFacts:
     """Everything but the Gaussians.
 
     Args:
-        scene: the log. colors: of the fit. image_width: of recorded images on the page, pixels (0 = no images).
-        most_images, most_points: how many images and LiDAR points the page may hold; taken evenly.
+        scene: the log. colors: of the fit. image_width: of recorded images on the page, pixels.
+        most_images: how many images the page may hold; taken evenly.
     """
     begin = begin_of(scene)
     frames = sorted(scene.frames, key=lambda frame: (frame.view.camera.name, frame.view.time_s))
@@ -69,7 +71,7 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
         )
         keys.append(key_rows(track.times_s - begin, track.world_from_object))
     places, images = _images(scene, frames, image_width, most_images)
-    sweeps, points = _lidar(scene, begin, most_points)
+    sweeps, points = _lidar(scene, begin)
     facts = {
         "title": scene.id, "end_s": max(frame.view.time_s for frame in frames) - begin, "begin_s": begin,
         "cameras": {name: _camera(camera, colors) for name, camera in scene.cameras.items()},
@@ -121,7 +123,7 @@ def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
 
 def _images(scene: Scene, frames: Sequence[Frame], width: int, most: int) -> tuple[list[list[int] | None], bytes]:
     """Place [offset, length] of every frame's image, None where it has none, and the files."""
-    if width <= 0 or most <= 0:
+    if most <= 0:
         return [None] * len(frames), b""
     chosen = set(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int).tolist())
     places, parts, at = [], [], 0
@@ -140,11 +142,11 @@ def _images(scene: Scene, frames: Sequence[Frame], width: int, most: int) -> tup
     return places, b"".join(parts)
 
 
-def _lidar(scene: Scene, begin: float, most: int) -> tuple[dict[str, Any], NDArray[np.uint16]]:
+def _lidar(scene: Scene, begin: float) -> tuple[dict[str, Any], NDArray[np.uint16]]:
     """Records of the sweeps, and their points in the world, evenly thinned."""
     clouds, records, first = [np.zeros((0, 3))], [], 0
-    share = max(1, most // max(1, len(scene.sweeps)))
-    for sweep in scene.sweeps if most > 0 else ():
+    share = max(1, MOST_POINTS // max(1, len(scene.sweeps)))
+    for sweep in scene.sweeps:
         xyz = read_points(scene, sweep).xyz
         xyz = xyz[np.square(xyz).sum(1) < REACH_M**2]
         xyz = xyz[:: max(1, -(-len(xyz) // share))].astype(np.float64)

@@ -27,7 +27,7 @@ from mudg.data.scene import read_image, read_scene, read_trusted_classes
 from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
 from mudg.models.mdm import files as mdm_files
 from mudg.models.mdm.model import MDM
-from mudg.stages.adapting.lessons import TRUSTED_LABELS, FitScene, LearntLog, Lesson, fit_lesson, lessons_of
+from mudg.stages.adapting.lessons import FitScene, LearntLog, Lesson, fit_lesson, lessons_of
 from mudg.stages.config import AdaptConfig
 from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.storage import load_model
@@ -89,7 +89,7 @@ class ClipMaker:
         self._scene, shown = read_scene(log.scene), read_scene(folder / "scene")
         self._cloud = read_fused(log.fused if lesson.shift_m else folder / "fuse")
         self._photos = [
-            Photo(f.view, read_image(shown, f), read_trusted_classes(shown, f, TRUSTED_LABELS)) for f in shown.frames
+            Photo(f.view, read_image(shown, f), read_trusted_classes(shown, f)) for f in shown.frames
         ]
         self._fitted = load_model(folder / "fit")
         self._sources: dict[int, WarpSource] = {}

@@ -34,9 +34,6 @@ from mudg.stages.fitting.planes import render_planes
 from mudg.stages.fitting.short import short_fit
 from mudg.stages.fitting.storage import load_model
 
-TRUSTED_LABELS = 0.5
-"""Labels of recorded images with a smaller confidence are not given to the model."""
-
 
 @dataclass(frozen=True)
 class Lesson:
@@ -112,7 +109,7 @@ def shown_photos(scene: Scene, lesson: Lesson, config: AdaptConfig, model: Scene
     """The pictures of a lesson: photographs, or photographs carried to the side by a fitted scene (at most `width_px` wide)."""
     photos = []
     for frame in (f for f in scene.frames if f.id in set(lesson.shown)):
-        photo = Photo(frame.view, read_image(scene, frame), read_trusted_classes(scene, frame, TRUSTED_LABELS))
+        photo = Photo(frame.view, read_image(scene, frame), read_trusted_classes(scene, frame))
         if lesson.shift_m:
             photo = carried(photo, moved_view(scene, frame.view, lesson.shift_m), model, width_px)
         photos.append(photo)

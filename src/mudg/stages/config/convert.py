@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -14,6 +15,8 @@ from mudg.base.config import STRICT
 class ConvertConfig:
     """Convert a published checkpoint to a model folder."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"shard_mb": ("memory_gb", 1024)}
+
     network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg", "lpips-squeeze"] = "diffusion"
     """What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings apply to diffusion
     models only."""
@@ -23,8 +26,6 @@ class ConvertConfig:
     """Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights."""
     towers: str = ""
     """OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own)."""
-    shard_mb: int = Field(default=1024, ge=1)
-    """Largest size of one weight file, in MB."""
     memory_gb: float = Field(default=0.0, ge=0)
     """Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 = derived from the
     file's size). Raise it if the conversion runs out of memory."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -16,10 +17,8 @@ from mudg.stages.config.harmonize import HarmonizeConfig
 class EditConfig:
     """Change a drive as an edit script says."""
 
-    changed_above: float = Field(default=4 / 255, ge=0, le=1)
-    """Images of an edited run keep the recorded pixels where renders with and without the edits differ by less than this, 0 to 1."""
-    grow_px: int = Field(default=2, ge=0)
-    """The rest is grown by this many pixels, and comes from the render of the edited scene."""
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"changed_above": ("harmonize", 4 / 255), "grow_px": ("harmonize", 2)}
+
     harmonize: HarmonizeConfig = Field(default_factory=HarmonizeConfig)
     """Of a whole run: let the diffusion model repair what the edits touch in its images."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"

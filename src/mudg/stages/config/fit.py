@@ -17,13 +17,13 @@ from mudg.stages.config.radiance import RadianceConfig
 class StartConfig:
     """Initial Gaussians."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"far_m": ("", 150.0)}
+
     gaussians: int = Field(default=70_000, ge=50)
     """Largest number of static Gaussians taken from the fused cloud; the same limit holds for all objects together."""
     voxel_m: float = Field(default=0.15, gt=0)
     """Static points are thinned to one per cube of this size, in metres (finer close to the recorded path). Smaller gives more
     detail and takes longer."""
-    far_m: float = Field(default=150.0, gt=1)
-    """Distance, in metres, at which pixels start that are neither sky nor within LiDAR range."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -44,30 +44,12 @@ class DensifyConfig:
 class ObjectConfig:
     """Dynamic objects."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"network_layers": ("", 4), "network_width": ("", 64)}
+
     deformable: bool = True
     """Let pedestrians and cyclists change shape inside their boxes."""
     mirror_start: bool = True
     """Initialise vehicles with their points mirrored to the side that LiDAR did not measure."""
-    network_layers: int = Field(default=4, ge=1)
-    """omnire: hidden layers of the network that deforms pedestrians and cyclists (published: 8)."""
-    network_width: int = Field(default=64, ge=1)
-    """omnire: width of these layers (published: 256)."""
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class HexplaneConfig:
-    """s3gaussian: sizes of the field that moves Gaussians."""
-
-    features: int = Field(default=8, ge=1)
-    """Numbers per place of a plane (published: 32)."""
-    levels: int = Field(default=2, ge=1, le=6)
-    """Planes of `space`, 2, 4, ... times as many cells (published: 4 sizes)."""
-    space: int = Field(default=64, ge=2)
-    """Cells along x, y and z of the smallest planes."""
-    time: int = Field(default=25, ge=2)
-    """Cells along the time, at most; no more than one for two frames."""
-    width: int = Field(default=64, ge=1)
-    """Width of the networks."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -140,6 +122,8 @@ class RecordedLossConfig:
 class VirtualConfig:
     """mudg_s: learning from virtual views. Loss weights of 0 turn a term off."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"densify": ("confidence_power", False)}
+
     probability: float = Field(default=0.4, ge=0, le=1)
     """Probability that a step uses a virtual view, 0 to 1 (published: 0.2)."""
     continued_probability: float = Field(default=1.0, ge=0, le=1)
@@ -157,8 +141,6 @@ class VirtualConfig:
     except with 0."""
     gaussians: int = Field(default=8000, ge=0)
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
-    densify: bool = False
-    """Let virtual views also decide where Gaussians are added."""
     confidence_power: float = Field(default=0.5, ge=0)
     """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all pixels count
     the same)."""
@@ -187,6 +169,10 @@ class VirtualConfig:
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class FitConfig:
     """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "hexplane": ("poses", {"features": 8, "levels": 2, "space": 64, "time": 25, "width": 64})
+    }
 
     method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"] = "mudg_s"
     """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, supervised by
@@ -218,7 +204,6 @@ class FitConfig:
     start: StartConfig = Field(default_factory=StartConfig)
     densify: DensifyConfig = Field(default_factory=DensifyConfig)
     objects: ObjectConfig = Field(default_factory=ObjectConfig)
-    hexplane: HexplaneConfig = Field(default_factory=HexplaneConfig)
     poses: PoseConfig = Field(default_factory=PoseConfig)
     appearance: AppearanceConfig = Field(default_factory=AppearanceConfig)
     drawing: DrawingConfig = Field(default_factory=DrawingConfig)

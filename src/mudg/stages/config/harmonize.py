@@ -16,7 +16,8 @@ class HarmonizeConfig:
     """Where and how far a diffusion model changes the views of an edited scene."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "weather_any_model": ("changed_above", False), "images_per_view": ("keep_classes", 24),
+        "weather_any_model": ("seed", False), "changed_above": ("seed", 4 / 255), "feather_px": ("seed", 3),
+        "images_per_view": ("seed", 24), "keep_classes": ("seed", True),
     }  # fmt: skip
 
     on: bool = False
@@ -34,12 +35,6 @@ class HarmonizeConfig:
     weather: float = Field(default=0.0, ge=0, le=1)
     """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it. For published-type
     models alone, whose points and reference are edited."""
-    changed_above: float = Field(default=4 / 255, ge=0, le=1)
-    """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as they are."""
-    feather_px: int = Field(default=3, ge=0)
-    """Generated pixels fade into the render over this many pixels, inside of what the edit touches."""
-    keep_classes: bool = True
-    """Keep the render where the model shows another object in place of a removed one, or none in place of one that is there."""
     seed: int = 0
     """Seed of the noise."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -14,6 +15,13 @@ from mudg.data.city.config import CityConfig
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class IngestConfig:
     """Convert a dataset log, or the built-in procedural city, to a scene directory."""
+
+    FIXED: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "city": (
+            "rate_hz", "hfov_deg", "rig_variation", "lidar_lower_deg", "lidar_upper_deg", "lidar_range_m", "lidar_noise_m", "lidar_dropout",
+            "style", "crossing", "shift_margin_m", "sensor_noise",
+        )
+    }  # fmt: skip
 
     resolution: str = ""
     """Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never

@@ -20,7 +20,11 @@ class LearnData:
 
     STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
     """Settings that may be addresses of an object store."""
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weathers": ("textures", 0), "effect_dropout": ("textures", 0.1)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "weathers": ("textures", 0), "effect_dropout": ("textures", 0.1), "frame_step": ("held_out_every", 1),
+        "label_confidence": ("depth", 0.5),
+    }  # fmt: skip
+
     width: int = Field(default=192, ge=32)
     """Width of the training images in pixels."""
     height: int = Field(default=128, ge=32)
@@ -78,12 +82,8 @@ class LearnData:
     """Logs: cameras to take clips from (empty = all)."""
     stride: int = Field(default=4, ge=1)
     """Logs: frames between the starts of two clips. Values below `window` give overlapping clips."""
-    frame_step: int = Field(default=1, ge=1)
-    """Logs: use every n-th frame only."""
     held_out_every: int = Field(default=5, ge=0)
     """Logs: every n-th clip is used for scoring only (0 = none)."""
-    label_confidence: float = Field(default=0.5, ge=0, le=1)
-    """Logs: classes with a confidence below this, 0 to 1, are not learned."""
     depth: Literal["annotated", "sweep"] = "annotated"
     """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's depth labels,
     weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
@@ -96,7 +96,7 @@ class LearnData:
 class LearnNetwork:
     """Shape of the denoising network and of the refiner behind it."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"effects": ("", 0)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"patch": ("refine_widths", 2), "effects": ("", 0)}
 
     widths: tuple[int, ...] = (64, 128, 224)
     """Channels of the network at each resolution level."""
@@ -106,8 +106,6 @@ class LearnNetwork:
     """For each level: whether it has attention between positions of a frame."""
     temporal_attention: tuple[bool, ...] = (False, False, True)
     """For each level: whether it has attention between frames."""
-    patch: int = Field(default=2, ge=1)
-    """Side of the squares of latent pixels that the network processes as one cell."""
     refine_widths: tuple[int, ...] = (64, 128)
     """Channels of the refiner at the latent resolution and at half of it (empty = no refiner)."""
     refine_blocks: tuple[int, ...] = (2, 3)
@@ -136,6 +134,8 @@ class LearnCodec:
 class LearnOptimizer:
     """AdamW, its learning-rate schedule, and the batch size."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weight_decay": ("clip_norm", 0.01)}
+
     batch_frames: int = Field(default=16, ge=1)
     """Frames per step over all processes. Steps use clips of half the window first, and whole windows at the end."""
     full_window_share: float = Field(default=0.3, ge=0, le=1)
@@ -150,8 +150,6 @@ class LearnOptimizer:
     """Learning rate of the last step, as a share of the largest one (1 = constant)."""
     betas: tuple[BelowOne, BelowOne] = (0.9, 0.99)
     """AdamW's decay rates of the mean gradient and of the mean squared gradient."""
-    weight_decay: float = Field(default=0.01, ge=0)
-    """AdamW's weight decay."""
     clip_norm: float = Field(default=1.0, ge=0)
     """Gradients with a larger norm than this are scaled down to it (0 = never)."""
     average_decay: float = Field(default=0.998, ge=0, lt=1)

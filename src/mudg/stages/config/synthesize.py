@@ -16,7 +16,9 @@ from mudg.base.devices import DeviceName
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"samples": ("condition", 1), "held_out_images": ("precision", False)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "samples": ("condition", 1), "label_confidence": ("align_depth", 0.5), "held_out_images": ("precision", False),
+    }  # fmt: skip
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
@@ -43,8 +45,6 @@ class SynthesizeConfig:
     colour alone."""
     given_classes: bool = True
     """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
-    label_confidence: float = Field(default=0.5, ge=0, le=1)
-    """Labels of recorded images with a confidence below this, 0 to 1, are not used."""
     align_depth: bool = True
     """Align generated depth to the LiDAR points in the same view (one scale and one shift per frame)."""
     overlap: int = Field(default=2, ge=0)

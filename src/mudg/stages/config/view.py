@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -13,6 +16,8 @@ from mudg.base.devices import DeviceName
 class PageConfig:
     """What a viewer page holds."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"image_width_px": ("images", 320), "lidar_points": ("", 20_000)}
+
     method: str = ""
     """Fit of a run to show (empty = the best one: mudg_s, else street_gaussians)."""
     budget: int = Field(default=3_000_000, ge=0)
@@ -21,22 +26,18 @@ class PageConfig:
     memory_mb: int = Field(default=0, ge=0)
     """Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit).
     Gaussians are left out as for the budget."""
-    image_width_px: int = Field(default=320, ge=0)
-    """Width of recorded images on the page, pixels (0 = none)."""
     images: int = Field(default=150, ge=0)
     """Most recorded images on the page, taken evenly."""
-    lidar_points: int = Field(default=20_000, ge=0)
-    """Most LiDAR points on the page, taken evenly from all sweeps."""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class ViewConfig(PageConfig):
     """What ``mudg view`` shows, and where."""
 
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"image_width_px": ("images", 640), "lidar_points": ("port", 20_000)}
+
     budget: int = Field(default=0, ge=0)
     """Most Gaussians on the page (0 = all)."""
-    image_width_px: int = Field(default=640, ge=0)
-    """Width of recorded images on the page, pixels (0 = none)."""
     port: int = Field(default=0, ge=0, le=65535)
     """Port to listen on (0 = any free one)."""
     host: str = "127.0.0.1"

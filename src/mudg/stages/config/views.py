@@ -17,7 +17,9 @@ from mudg.stages.config.harmonize import HarmonizeConfig
 class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"sky_below_alpha": ("video", 0.5)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "height_m": ("width_px", 0.0), "yaw_deg": ("width_px", 0.0), "sky_below_alpha": ("video", 0.5), "fps": ("harmonize", 10.0),
+    }  # fmt: skip
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras to render (empty = the first camera). A name that the scene lacks is an error."""
@@ -26,18 +28,12 @@ class RenderConfig:
     paths: tuple[str, ...] = ()
     """Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m
     further ahead with every frame. A minus means down, right, slower."""
-    height_m: float = 0.0
-    """Vertical shift in metres, positive upwards; applies to every shift."""
-    yaw_deg: float = 0.0
-    """Yaw in degrees, counter-clockwise seen from above; applies to every shift."""
     width_px: int = Field(default=0, ge=0)
     """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
     """Ids of tracked objects to leave out, as listed in the scene."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
-    fps: float = Field(default=10.0, gt=0)
-    """Frames per second of the videos."""
     harmonize: HarmonizeConfig = Field(default_factory=HarmonizeConfig)
     """With an edit script: let the diffusion model repair what the edits touch."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"

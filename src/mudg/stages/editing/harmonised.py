@@ -48,15 +48,15 @@ from mudg.stages.editing.vacated import (
     touched_boxes,
     vacated_at,
 )
-from mudg.stages.editing.written import EditedImages
+from mudg.stages.editing.written import CHANGED_ABOVE, GROWN_PX, EditedImages
 from mudg.stages.fitting.planes import FAR_M, render_planes
 from mudg.stages.fitting.rendering import raster_of, render_view
 from mudg.stages.learning import loading
 from mudg.stages.learning.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_images, windows
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
-GROWN_PX: Final = 2
-"""Touched pixels are grown by this much: a render fades out beyond what differs clearly."""
+FEATHER_PX: Final = 3
+"""Generated pixels fade into the render over this many pixels, inside of what the edit touches."""
 BRIGHTER: Final = 0.02
 """Ground that other moments show brighter than the render by this, 0 to 1, lay in a shadow."""
 CONTACT_REACH: Final = 0.2
@@ -140,7 +140,7 @@ class EditedSources:
         return cls(fitted, plan, cleared_cloud(cloud, plan), edited.tracks, photos)
 
 
-def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation], changed_above: float) -> Touched:
+def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation]) -> Touched:
     """What edits touch in a view.
 
     Args:
@@ -148,7 +148,7 @@ def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Obse
     """
     usual, made = pictures
     before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
-    differs = ((made.rgb - usual.rgb).abs().amax(0) > changed_above).numpy()
+    differs = ((made.rgb - usual.rgb).abs().amax(0) > CHANGED_ABOVE).numpy()
     differs = np.asarray(ndimage.binary_dilation(differs, iterations=GROWN_PX), bool) if differs.any() else differs
     old_ground, new_box, new_ground = ground_mask(view, before), boxes_mask(view, after), ground_mask(view, after)
     near = new_box | ground_mask(view, after, CONTACT_REACH)
@@ -159,12 +159,10 @@ def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Obse
     return Touched(*(torch.from_numpy(mask) for mask in (objects, uncovered, shaded)))
 
 
-def soft_edge(mask: NDArray[np.bool_], feather_px: int) -> Tensor:
-    """Weights f32[H,W]: 0 outside of a mask, growing to 1 over `feather_px` pixels inside."""
-    if not feather_px:
-        return torch.from_numpy(mask).float()
+def soft_edge(mask: NDArray[np.bool_]) -> Tensor:
+    """Weights f32[H,W]: 0 outside of a mask, growing to 1 over `FEATHER_PX` pixels inside."""
     inner = ndimage.distance_transform_edt(mask)
-    return torch.from_numpy(np.clip(np.asarray(inner) / (feather_px + 1), 0, 1).astype(np.float32))
+    return torch.from_numpy(np.clip(np.asarray(inner) / (FEATHER_PX + 1), 0, 1).astype(np.float32))
 
 
 def start_clip(renders: Sequence[Observation], freedom: Sequence[Tensor], size: tuple[int, int]) -> StartClip:
@@ -247,7 +245,7 @@ class Harmoniser:
 
     def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
         usual, made = draw(view)
-        touched = touched_pixels(self._sources.plan, view, (usual, made), self._config.changed_above)
+        touched = touched_pixels(self._sources.plan, view, (usual, made))
         if not bool(touched.uncovered.any()):
             return made, touched
         sure = determined(render_planes(self._sources.fitted, view), ~touched.any)
@@ -259,9 +257,8 @@ class Harmoniser:
         objects = touched.objects & (self._config.objects > 0)
         touched = replace(touched, shaded=lit & (self._config.uncovered > 0), objects=objects)
         boxes = boxes_mask(render.view, others(self._sources.plan, render.view.time_s))
-        kept = guarded(touched, render, made, boxes) if self._config.keep_classes else touched.any
-        kept = kept & made.mask[0]
-        return pasted(render, made, soft_edge(kept.numpy(), self._config.feather_px))
+        kept = guarded(touched, render, made, boxes) & made.mask[0]
+        return pasted(render, made, soft_edge(kept.numpy()))
 
 
 def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> EditedImages:

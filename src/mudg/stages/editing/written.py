@@ -29,6 +29,10 @@ from mudg.stages.editing.weathered import SEED
 from mudg.stages.fitting.rendering import raster_of, render_view
 
 NOTE: Final = "edited: parts of the images are renders of a fitted scene"
+CHANGED_ABOVE: Final = 4 / 255
+"""Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as recorded or rendered."""
+GROWN_PX: Final = 2
+"""The rest is grown by this much: a render fades out beyond what differs clearly."""
 KEPT_LABELS: Final = ("semantics", "depth", "sky", "dynamic")
 """Labels that a changed image keeps; others speak of the recording."""
 RENDERED: Final = "rendered"
@@ -57,9 +61,8 @@ class EditedImages:
         if self.whole:
             return to_bytes(made.rgb), np.ones(recorded.shape[:2], bool), made
         usual = render_view(self.before, frame.view, raster)
-        changed = ((made.rgb - usual.rgb).abs().amax(0) > self.config.changed_above).numpy()
-        if self.config.grow_px and changed.any():
-            changed = np.asarray(ndimage.binary_dilation(changed, iterations=self.config.grow_px), bool)
+        changed = ((made.rgb - usual.rgb).abs().amax(0) > CHANGED_ABOVE).numpy()
+        changed = np.asarray(ndimage.binary_dilation(changed, iterations=GROWN_PX), bool) if changed.any() else changed
         return np.where(changed[..., None], to_bytes(made.rgb), recorded), changed, made
 
 

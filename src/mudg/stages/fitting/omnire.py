@@ -24,6 +24,8 @@ from mudg.stages.fitting.views import StoredView, TrainView
 
 RIGID_SHARE: Final = 0.1
 """Share of the run before the network joins (published: 3000 of 30,000 steps)."""
+LAYERS, WIDTH = 4, 64
+"""Hidden layers of the network, and their width (published: 8 of 256)."""
 LIDAR_WEIGHT: Final = 0.01
 """Of the mean absolute difference of depth, per metre."""
 
@@ -43,8 +45,7 @@ class OmniRecipe(OwnRecipe):
         if not limbed:
             return model
         times = [frame.view.time_s for frame in scene.frames]
-        layers, width = config.objects.network_layers, config.objects.network_width
-        field = DeformationField.fresh((min(times), max(times)), layers, width, len(limbed), config.seed)
+        field = DeformationField.fresh((min(times), max(times)), LAYERS, WIDTH, len(limbed), config.seed)
         nodes = [
             DeformedNode.of_rigid(node, limbed.index(node)) if isinstance(node, DeformableNode) else node
             for node in model.nodes

@@ -35,6 +35,8 @@ SSIM_SHARE: Final = 0.2
 LIDAR_WEIGHT, LIDAR_SPAN_M = 0.5, 80.0
 MOVE_WEIGHT, COLOR_WEIGHT = 0.001, 0.001
 SPACE_WEIGHT, TIME_WEIGHT, FLAT_WEIGHT = 1e-4, 0.01, 1e-4
+SIZES: Final = PlaneSizes(features=8, levels=2, space=64, time=25, width=64)
+"""Of the planes and networks (published: 32 features, 4 levels)."""
 FRAMES_PER_CELL: Final = 2
 """Frames of a cell of time (published: 25 cells for 50 frames): what lies between two shown frames must not have one of its own."""
 BOX_MARGIN: Final = 0.02
@@ -62,14 +64,12 @@ class FieldRecipe(OwnRecipe):
         margin = BOX_MARGIN * (high - low) + 0.1
         times = [frame.view.time_s for frame in scene.frames]
         first, last = min(times), max(max(times), min(times) + 1e-3)
-        wanted = config.hexplane
-        moments = max(2, min(wanted.time, len(set(times)) // FRAMES_PER_CELL))
-        sizes = PlaneSizes(wanted.features, wanted.levels, wanted.space, moments, wanted.width)
+        sizes = replace(SIZES, time=max(2, min(SIZES.time, len(set(times)) // FRAMES_PER_CELL)))
         gain = SHORT_GAIN if config.iterations < FIELD_STEPS else 1.0
         node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
         columns = found.points.columns(classes, config.sh_degree)
         log.info(
-            f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {wanted.levels} x 6 planes"
+            f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {sizes.levels} x 6 planes"
         )
         owner = torch.zeros(len(found.time_s), dtype=torch.int32)
         return SceneModel(

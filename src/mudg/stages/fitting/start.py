@@ -34,6 +34,8 @@ UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffi
 GROUND_IDS = tuple(ID[n] for n in ("road", "sidewalk", "terrain"))
 FILL_CELL_PX = 8
 FILL_FRAMES = 30
+FAR_M = 150.0
+"""Depth at which pixels start that are neither sky nor within LiDAR range."""
 SKY_ROWS = 192
 FEWEST_OBJECT_POINTS = 150
 MIRROR_APART_M = 0.25
@@ -100,7 +102,7 @@ def _static_columns(
     centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
     rows = thinned(cloud.xyz, centers, config)
     points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
-    filled = fill_unreached(views, points.xyz, classes, config.start.far_m, fused.colors)
+    filled = fill_unreached(views, points.xyz, classes, fused.colors)
     return (points if filled is None else StartPoints.joined([points, filled])).columns(classes, config.sh_degree)
 
 
@@ -153,19 +155,19 @@ def _object_columns(
 
 
 def fill_unreached(
-    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float, cameras: CameraColors
+    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
 ) -> StartPoints | None:
     """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
     labelled = [index for index, head in enumerate(heads_of(views)) if head.labelled]
     if not labelled or not classes:
         return None
     chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
-    points = StartPoints.joined([_fill_view(views[index], xyz, classes, far_m, cameras) for index in chosen])
+    points = StartPoints.joined([_fill_view(views[index], xyz, classes, cameras) for index in chosen])
     return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))] if len(points) else None
 
 
 def _fill_view(
-    stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], far_m: float, cameras: CameraColors
+    stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
 ) -> StartPoints:
     view, cell = stored.view, FILL_CELL_PX
     rows, columns = view.camera.height // cell, view.camera.width // cell
@@ -179,14 +181,14 @@ def _fill_view(
     wanted = ~covered & np.isin(label, [i for i in range(19) if i not in (*DYNAMIC_IDS, *GROUND_IDS, ID["sky"])])
     if stored.mask is not None:
         wanted &= stored.mask[center_row, center_column]
-    guess = np.full((rows, columns), far_m)
+    guess = np.full((rows, columns), FAR_M)
     below = np.full((256, columns), np.inf)  # per class: depth of the last covered cell below, in this column
     every = np.arange(columns)
     for row in range(rows - 1, -1, -1):
         known = covered[row] & np.isin(label[row], UPRIGHT_IDS)
         below[label[row, known], every[known]] = depth[row, known]
         surface = below[label[row], every]
-        guess[row] = np.where(np.isfinite(surface), surface, far_m)
+        guess[row] = np.where(np.isfinite(surface), surface, FAR_M)
     row, column = wanted.nonzero()
     uv = np.stack([column * cell + cell / 2, row * cell + cell / 2], 1)
     z = guess[row, column]

@@ -66,7 +66,7 @@ def timed_points(
     chosen = [
         (StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])), time_s[rows]) for rows in parts
     ]
-    filled = fill_unreached(views, xyz, classes, config.start.far_m, colors)
+    filled = fill_unreached(views, xyz, classes, colors)
     if filled is not None:
         chosen.append((filled, np.full(len(filled), np.nan)))
     return TimedPoints(StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen]))

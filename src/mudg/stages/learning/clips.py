@@ -124,8 +124,8 @@ def _log_rules(config: LearnConfig, size: tuple[int, int], held_out_every: int, 
     data = config.data
     least_points = (1.0 if points_alone else LogClipRules.least_points) if data.least_points is None else data.least_points
     return LogClipRules(
-        *size, window=data.window, stride=data.stride, frame_step=data.frame_step, cameras=data.cameras, held_out_every=held_out_every,
-        label_confidence=data.label_confidence, seed=config.seed, published=points_alone, depth=data.depth, least_points=least_points,
+        *size, window=data.window, stride=data.stride, cameras=data.cameras, held_out_every=held_out_every,
+        seed=config.seed, published=points_alone, depth=data.depth, least_points=least_points,
     )  # fmt: skip
 
 

@@ -28,6 +28,8 @@ from mudg.stages.learning import published as learn_published
 from mudg.stages.learning import score as learn_score
 
 Model = MDM | PublishedMDM
+PATCH = 2
+"""Side of the squares of latent pixels that the network processes as one cell."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def model_config(config: LearnConfig) -> MDMConfig:
     shape["refine_blocks"] = shape["refine_blocks"] if shape["refine_widths"] else ()
     if not (shape["finish_widths"] and shape["refine_widths"] and shape["renders"]):
         shape["finish_widths"] = shape["finish_blocks"] = ()
-    return MDMConfig(**shape, window=config.data.window, area_px=config.data.width * config.data.height)
+    return MDMConfig(**shape, patch=PATCH, window=config.data.window, area_px=config.data.width * config.data.height)
 
 
 def freeze(model: Model, what: str) -> int:

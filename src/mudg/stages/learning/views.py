@@ -54,7 +54,7 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
 def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames_in("train")
-    classes = lambda frame: read_trusted_classes(scene, frame, config.label_confidence) if config.given_classes else None  # noqa: E731
+    classes = lambda frame: read_trusted_classes(scene, frame) if config.given_classes else None  # noqa: E731
     return [Photo(frame.view, read_image(scene, frame), classes(frame), recorded_pixels(scene, frame)) for frame in frames]
 
 

@@ -12,7 +12,7 @@ import math
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -45,8 +45,21 @@ from mudg.stages.radiance.storage import save_field
 
 WARM_UP = 0.1
 FALLS_AT, FALL = (0.25, 0.5, 0.75, 0.9), 0.33
-SIGHT_M, SIGHT_HALVES = 6.0, 0.2
-BETAS, EPSILON = (0.9, 0.99), 1e-15
+RATE, BETAS, EPSILON, WEIGHT_DECAY = 0.01, (0.9, 0.99), 1e-15, 1e-5
+"""Of Adam. The rate rises over the first WARM_UP of the run and falls at the shares FALLS_AT; the decay is added to the gradient."""
+PROPOSALS_EVERY = 5
+"""After the warm-up the proposal networks learn at every n-th step only."""
+ERROR_SHARE = 0.25
+"""Share of the pixels that are drawn where the colour error was large."""
+NEAR_M, FAR_M = 0.1, 1000.0
+"""Distances of the nearest and of the farthest sample."""
+APPEARANCE = 16
+"""Numbers that describe the appearance of a camera."""
+WEIGHTS = Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
+"""Published, but for the dynamic density: 0.01, at once."""
+SIGHT_START, SIGHT_M, SIGHT_LEAST_M, SIGHT_HALVES = 0.08, 6.0, 0.6, 0.2
+"""Share of the run before the line of sight counts; half width of its surface then, and at the end (published: 2.5 m); share of the run in
+which it halves."""
 DYNAMIC_RISE = (0.1, 0.5)
 """Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that field."""
 LOG_EVERY = 20
@@ -95,7 +108,7 @@ def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.devic
         log.info("the sky of this scene is not labelled: fitted without the sky term")
     facts = {"method": config.method, "scene": scene.id}
     field = RadianceField(sizes_of(config.radiance), extent, cameras, facts, config.seed).to(device)
-    state = RadianceState(field, _optimisers(field, config.radiance), pixels, lidar, shown)
+    state = RadianceState(field, _optimisers(field), pixels, lidar, shown)
     found = checkpoint.latest(folder.path / "steps")
     if found is not None:
         log.info(f"resuming at step {found.step} of {config.iterations}")
@@ -107,12 +120,12 @@ def sizes_of(settings: RadianceConfig) -> FieldSizes:
     """The sizes of the networks."""
     proposals = (settings.first_proposal_grid, settings.second_proposal_grid)
     return FieldSizes(settings.static_grid, settings.dynamic_grid, settings.flow_grid, proposals, settings.width,
-                      settings.proposal_width, settings.appearance)  # fmt: skip
+                      settings.proposal_width, APPEARANCE)  # fmt: skip
 
 
 def budget_of(settings: RadianceConfig) -> Budget:
     """The samples of a ray."""
-    return Budget(settings.proposal_samples, settings.samples, settings.near_m, settings.far_m)
+    return Budget(settings.proposal_samples, settings.samples, NEAR_M, FAR_M)
 
 
 # ---- the loop --------------------------------------------------------------------------------------------------------
@@ -147,14 +160,14 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
     settings, field = config.radiance, state.field
     device, budget = field.device, budget_of(settings)
-    weights = loss_weights(settings, dynamic_share(step, config.iterations))
-    learns = step <= WARM_UP * config.iterations or step % settings.proposals_every == 0
+    weights = replace(WEIGHTS, dynamic=WEIGHTS.dynamic * dynamic_share(step, config.iterations))
+    learns = step <= WARM_UP * config.iterations or step % PROPOSALS_EVERY == 0
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
-            group["lr"] = settings.rate * rate_share(step, config.iterations)
+            group["lr"] = RATE * rate_share(step, config.iterations)
 
     generator = batch_generator(config.seed, step, "pixels")
-    batch = state.pixels.batch(settings.rays, settings.error_share, generator)
+    batch = state.pixels.batch(settings.rays, ERROR_SHARE, generator)
     marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
     sky = None if batch.sky is None else batch.sky.to(device)
     terms, error = pixel_terms(
@@ -168,7 +181,7 @@ def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, T
     generator = batch_generator(config.seed, step, "lidar")
     given, range_m = state.lidar.batch(settings.lidar_rays, field.extent, generator)
     marched, draws, _ = _marched(field, given, budget, generator, learns)
-    sight_m = sight_width(step, config.iterations, settings)
+    sight_m = sight_width(step, config.iterations)
     measured = lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
     _learn(state, measured, marched, learns, f"step {step}, LiDAR")
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
@@ -190,7 +203,7 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
     if not bool(torch.isfinite(total)):
         odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
         raise NumericsError("a loss term is not finite", where=where, got=", ".join(odd) or "proposals",
-                            remedy="the parameters are those of the step before; lower --radiance.rate")  # fmt: skip
+                            remedy="the parameters are those of the step before; another --seed draws other rays")  # fmt: skip
     for optimiser in state.optimisers:
         optimiser.zero_grad(set_to_none=True)
     total.backward()
@@ -200,15 +213,9 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
         odd = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
         if odd:
             raise NumericsError("a gradient is not finite", where=where, got=", ".join(odd[:3]),
-                                remedy="the parameters are those of the step before; lower --radiance.rate")  # fmt: skip
+                                remedy="the parameters are those of the step before; another --seed draws other rays")  # fmt: skip
     for optimiser in state.optimisers[: 2 if learns else 1]:
         optimiser.step()
-
-
-def loss_weights(settings: RadianceConfig, moving: float = 1.0) -> Weights:
-    """The weights of a configuration; ``moving``: share of that of the dynamic density."""
-    return Weights(settings.sky_weight, settings.lidar_weight, settings.sight_weight, moving * settings.dynamic_weight,
-                   settings.shadow_weight, settings.cycle_weight)  # fmt: skip
 
 
 def rate_share(step: int, iterations: int) -> float:
@@ -223,10 +230,10 @@ def dynamic_share(step: int, iterations: int) -> float:
     return min(1.0, max(0.0, (step / iterations - first) / max(last - first, 1e-9)))
 
 
-def sight_width(step: int, iterations: int, settings: RadianceConfig) -> float:
+def sight_width(step: int, iterations: int) -> float:
     """Half width of the surface in the line-of-sight term at a step, metres; 0 before it begins."""
-    since = step / iterations - settings.sight_start
-    return 0.0 if since <= 0 else max(settings.sight_least_m, SIGHT_M * 0.5 ** math.floor(since / SIGHT_HALVES))
+    since = step / iterations - SIGHT_START
+    return 0.0 if since <= 0 else max(SIGHT_LEAST_M, SIGHT_M * 0.5 ** math.floor(since / SIGHT_HALVES))
 
 
 def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
@@ -238,13 +245,13 @@ def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
 # ---- the optimisers, and checkpoints ---------------------------------------------------------------------------------
 
 
-def _optimisers(field: RadianceField, settings: RadianceConfig) -> tuple[torch.optim.Adam, torch.optim.Adam]:
+def _optimisers(field: RadianceField) -> tuple[torch.optim.Adam, torch.optim.Adam]:
     proposals = list(field.proposals.parameters())
     own = {id(value) for value in proposals}
     fused = field.device.type in ("cpu", "cuda")
     first, second = (
         torch.optim.Adam(
-            given, settings.rate, BETAS, EPSILON, settings.weight_decay, fused=fused, foreach=None if fused else False
+            given, RATE, BETAS, EPSILON, WEIGHT_DECAY, fused=fused, foreach=None if fused else False
         )
         for given in ([value for value in field.parameters() if id(value) not in own], proposals)
     )

@@ -38,6 +38,8 @@ from mudg.stages.viewing.frames import LAYERS, FrameRequest, FrameSource, VideoR
 from mudg.stages.viewing.server import Answer, Site, SiteServer, Stream, address_of, open_server, show, token_for
 
 MEGABYTE: Final = 1e6
+PAGE_IMAGE_PX, LIVE_IMAGE_PX = 320, 640
+"""Width of recorded images on a page of one file, and on one that a server shows."""
 NAMES: Final = {"mudg_s": "with diffusion", "street_gaussians": "without diffusion"}
 
 
@@ -225,7 +227,7 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     scene, begin = shown.scene, begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
     packed = [(name, pack_scene(model, begin, path, _most(config, model, len(shown.fits)), CHUNK)) for name, model in shown.fits]
-    facts = log_facts(scene, shown.fits[0][1].colors, config.image_width_px, config.images, config.lidar_points)
+    facts = log_facts(scene, shown.fits[0][1].colors, PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX, config.images)
     facts = with_particles(with_ground(facts, shown.ground()), SEED)
     first = packed[0][1]
     return ViewerPage(
