@@ -487,7 +487,7 @@ def _hostile(kind: str) -> bytes:
 
 SAID = {
     "index bomb": "unpack to more", "metadata bomb": "unpack to more", "huge array": "larger than its file",
-    "array without chunks": "larger than its file", "pickled array": "packed in a way", "another codec": "packed in a way",
+    "array without chunks": "chunk of an array is missing", "pickled array": "packed in a way", "another codec": "packed in a way",
     "chunk that says it is larger": "larger than its file|another size|damaged", "member outside": "outside of the file",
     "index of another kind": "index", "deep metadata": "are damaged", "nothing in it": "cannot be read|no poses",
     "a million lists": "cannot be read|no poses",
@@ -510,6 +510,50 @@ def test_metadata_that_would_fill_the_memory_are_refused_before_they_are_taken_a
     monkeypatch.setattr("mudg.base.memory.free_bytes", lambda: 50 << 20)
     with pytest.raises(ResourceError, match=r"needs more memory(?s:.*)68.7 MiB"):
         container._cbor(b"\x9a\x00\x0d\xbb\xa0" + b"\x80" * 900_000, "a store")
+
+
+def as_folder(recording: Path, folder: Path) -> Path:
+    """The store of a recording as a folder, as zarr keeps it without a tar file."""
+    (path,) = recording.glob("*.itar")
+    store = folder / path.name.removesuffix(".itar")
+    for name, member in container._members_of_tar(path).items():
+        (store / name).parent.mkdir(parents=True, exist_ok=True)
+        (store / name).write_bytes(member.read())
+    return store
+
+
+@needs_package
+@pytest.mark.parametrize("lost", ["distance_m/0.0", "direction/0.0", "timestamp_us/0", "image/0"])
+def test_a_lost_chunk_is_named_and_never_filled(recording: Path, tmp_path: Path, lost: str) -> None:
+    store = as_folder(recording, tmp_path)
+    assert len(ingest(tmp_path, tmp_path / "whole").frames) == 10
+    chunk = sorted(store.rglob(f"*{lost}"))[1]
+    chunk.unlink()
+    error = roundtrip.assert_refused(ingest, tmp_path, tmp_path / "out", "chunk of an array is missing")
+    assert error.where.endswith(f"{store.name}: {chunk.relative_to(store).as_posix()}")
+
+
+@pytest.mark.parametrize(
+    ("shape", "chunks", "there", "lost"),
+    [
+        ([5], [2], ["0", "1", "2"], ""),
+        ([5], [2], ["0", "1"], "2"),
+        ([5], [2], ["0", "1", "3"], "2"),  # as many as needed, but not those
+        ([4, 5], [2, 3], ["0.0", "0.1", "1.1"], "1.0"),
+        ([], [], [], "0"),
+        ([], [], ["0"], ""),
+        ([0, 3], [1, 3], [], ""),
+    ],
+)
+def test_every_chunk_of_the_grid_must_be_there(
+    tmp_path: Path, shape: list[int], chunks: list[int], there: list[str], lost: str
+) -> None:
+    about = {**ARRAY, "shape": shape, "chunks": chunks}
+    (tmp_path / "chunk").write_bytes(bytes(4 * int(np.prod(chunks))))
+    stored = container._StoredMember(tmp_path / "chunk", 0, 4 * int(np.prod(chunks)))
+    problem = contextlib.nullcontext() if not lost else pytest.raises(InputError, match=f"missing(?s:.*)x/{lost}")
+    with problem:
+        container._check_array(about, dict.fromkeys(there, stored), "x")
 
 
 def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
