@@ -569,6 +569,25 @@ def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], ob
     return folder
 
 
+@needs_package
+def test_components_and_entries_of_others_are_named_once(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ingest(next(recording.glob("*.json")), tmp_path / "official")
+    assert "passed over" not in capsys.readouterr().err
+    folder = tmp_path / "log"
+    folder.mkdir()
+    altered(recording, folder, lambda metadata: metadata.update({f"thermal/{n}/.zgroup": {"zarr_format": 2} for n in "ab"}))
+    listed = json.loads(next(recording.glob("*.json")).read_text())
+    listed["component_stores"][0]["sha256"] = ""
+    (folder / "a.json").write_text(json.dumps(listed))
+    ingest(folder / "a.json", tmp_path / "out")
+    assert [line for line in capsys.readouterr().err.splitlines() if "passed over" in line] == [
+        "passed over: 'component_stores.sha256' in a.json, which this program does not know",
+        "passed over: 'thermal' in the stores of the recording, which this program does not know",
+    ]
+
+
 FRONT = "intrinsics/default/cameras/front/.zattrs"
 RIG_POSES, BOXES = "poses/default/dynamic_poses/.zattrs", "cuboids/default/cuboids/.zattrs"
 

@@ -22,6 +22,7 @@ import numpy as np
 from mudg.base import memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.data.importers.columns import record_fields
+from mudg.data.unknown_fields import note_unknown
 
 METADATA: Final = ".zmetadata.cbor.xz"
 _BLOCK: Final = 512
@@ -36,6 +37,10 @@ _CONTAINER_BYTES: Final = 72
 _MOST_LZ4: Final = 256
 _BLOSC_HEADER: Final = struct.Struct("<4B3I")
 _KINDS: Final = "biufS"
+COMPONENTS: Final = frozenset({
+    "poses", "intrinsics", "masks", "cameras", "lidars", "radars", "cuboids", "point_clouds", "camera_labels",
+})  # fmt: skip
+"""Components of the format, read or not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,8 @@ def check_store(path: Path) -> None:
     with record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
         chunks = _chunk_sizes(members)
+        groups = dict.fromkeys(name.partition("/")[0] for name in metadata if "/" in name)
+        note_unknown("the stores of the recording", groups, COMPONENTS)
         for name, about in metadata.items():
             if name.endswith(".zarray"):
                 place = name.removesuffix(".zarray")
