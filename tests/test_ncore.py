@@ -487,7 +487,7 @@ def _hostile(kind: str) -> bytes:
 
 SAID = {
     "index bomb": "unpack to more", "metadata bomb": "unpack to more", "huge array": "larger than its file",
-    "array without chunks": "larger than its file", "pickled array": "packed in a way", "another codec": "packed in a way",
+    "array without chunks": "chunk of an array is missing", "pickled array": "packed in a way", "another codec": "packed in a way",
     "chunk that says it is larger": "larger than its file|another size|damaged", "member outside": "outside of the file",
     "index of another kind": "index", "deep metadata": "are damaged", "nothing in it": "cannot be read|no poses",
     "a million lists": "cannot be read|no poses",
@@ -512,6 +512,50 @@ def test_metadata_that_would_fill_the_memory_are_refused_before_they_are_taken_a
         container._cbor(b"\x9a\x00\x0d\xbb\xa0" + b"\x80" * 900_000, "a store")
 
 
+def as_folder(recording: Path, folder: Path) -> Path:
+    """The store of a recording as a folder, as zarr keeps it without a tar file."""
+    (path,) = recording.glob("*.itar")
+    store = folder / path.name.removesuffix(".itar")
+    for name, member in container._members_of_tar(path).items():
+        (store / name).parent.mkdir(parents=True, exist_ok=True)
+        (store / name).write_bytes(member.read())
+    return store
+
+
+@needs_package
+@pytest.mark.parametrize("lost", ["distance_m/0.0", "direction/0.0", "timestamp_us/0", "image/0"])
+def test_a_lost_chunk_is_named_and_never_filled(recording: Path, tmp_path: Path, lost: str) -> None:
+    store = as_folder(recording, tmp_path)
+    assert len(ingest(tmp_path, tmp_path / "whole").frames) == 10
+    chunk = sorted(store.rglob(f"*{lost}"))[1]
+    chunk.unlink()
+    error = roundtrip.assert_refused(ingest, tmp_path, tmp_path / "out", "chunk of an array is missing")
+    assert error.where.endswith(f"{store.name}: {chunk.relative_to(store).as_posix()}")
+
+
+@pytest.mark.parametrize(
+    ("shape", "chunks", "there", "lost"),
+    [
+        ([5], [2], ["0", "1", "2"], ""),
+        ([5], [2], ["0", "1"], "2"),
+        ([5], [2], ["0", "1", "3"], "2"),  # as many as needed, but not those
+        ([4, 5], [2, 3], ["0.0", "0.1", "1.1"], "1.0"),
+        ([], [], [], "0"),
+        ([], [], ["0"], ""),
+        ([0, 3], [1, 3], [], ""),
+    ],
+)
+def test_every_chunk_of_the_grid_must_be_there(
+    tmp_path: Path, shape: list[int], chunks: list[int], there: list[str], lost: str
+) -> None:
+    about = {**ARRAY, "shape": shape, "chunks": chunks}
+    (tmp_path / "chunk").write_bytes(bytes(4 * int(np.prod(chunks))))
+    stored = container._StoredMember(tmp_path / "chunk", 0, 4 * int(np.prod(chunks)))
+    problem = contextlib.nullcontext() if not lost else pytest.raises(InputError, match=f"missing(?s:.*)x/{lost}")
+    with problem:
+        container._check_array(about, dict.fromkeys(there, stored), "x")
+
+
 def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """A recording whose metadata say something else."""
     import cbor2  # type: ignore[import-not-found]
@@ -523,6 +567,25 @@ def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], ob
     change(metadata)
     (folder / path.name).write_bytes(_itar(members, metadata))
     return folder
+
+
+@needs_package
+def test_components_and_entries_of_others_are_named_once(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ingest(next(recording.glob("*.json")), tmp_path / "official")
+    assert "passed over" not in capsys.readouterr().err
+    folder = tmp_path / "log"
+    folder.mkdir()
+    altered(recording, folder, lambda metadata: metadata.update({f"thermal/{n}/.zgroup": {"zarr_format": 2} for n in "ab"}))
+    listed = json.loads(next(recording.glob("*.json")).read_text())
+    listed["component_stores"][0]["sha256"] = ""
+    (folder / "a.json").write_text(json.dumps(listed))
+    ingest(folder / "a.json", tmp_path / "out")
+    assert [line for line in capsys.readouterr().err.splitlines() if "passed over" in line] == [
+        "passed over: 'component_stores.sha256' in a.json, which this program does not know",
+        "passed over: 'thermal' in the stores of the recording, which this program does not know",
+    ]
 
 
 FRONT = "intrinsics/default/cameras/front/.zattrs"

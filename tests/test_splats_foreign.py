@@ -208,7 +208,7 @@ def test_plain_sizes_and_opacities_are_refused_where_logarithms_and_logits_are_d
         ({name: LINEAR[name] for name in ("scale_0", "scale_1", "scale_2")}, "logarithms are due"),
         ({"opacity": [255.0, 40.0, 128.0]}, "from 0 to 255"),
         ({"f_dc_0": 200.0, "f_dc_1": 120.0, "f_dc_2": 90.0}, "from 0 to 255"),
-        ({"trbf_center": 0.5, "motion_0": 0.1}, "motion over time are not read: trbf_center, motion_0"),
+        ({"trbf_center": 0.5, "motion_0": 0.1}, "motion over time are not read: 'trbf_center', 'motion_0'"),
     ],
 )
 def test_values_and_columns_of_another_kind_are_named(changes: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -226,7 +226,7 @@ def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -
 
 def test_colours_of_another_space_and_pictures_with_loss_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     read(foreign.ply(after=("element color_space 1\nproperty uchar color_space", b"\1")))
-    assert "color_space is not read" in capsys.readouterr().err.replace("\n", " ")
+    assert "'color_space' is not read" in capsys.readouterr().err.replace("\n", " ")
     read(foreign.sog(lossy="c"), "a.sog")
     assert "with loss" in capsys.readouterr().err.replace("\n", " ")
 
@@ -337,11 +337,49 @@ def test_points_are_still_called_points() -> None:
 def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.CaptureFixture[str]) -> None:
     cloud = read(foreign.sog(extras={"a": 1}, lod=3, **{"means.order": "morton", "sh0.gamma": 2}), "a.sog")
     said = capsys.readouterr().err.replace("\n", " ")
-    assert "extras, lod, means.order, sh0.gamma" in said and "warning" not in said
+    assert "'extras', 'lod', 'means.order', 'sh0.gamma' in meta.json" in said and "warning" not in said
     assert np.allclose(sorted(np.abs(cloud.means).max(1)), [0, math.e - 1])
     assert read(foreign.compressed_ply(-1, 1, more="state"), "a.ply").opacity[0] == pytest.approx(200 / 255, abs=1e-6)
     read(foreign.glb(kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}), "a.glb")
-    assert "EXT_other, KHR_gaussian_splatting.lod" in capsys.readouterr().err.replace("\n", " ")
+    assert "'EXT_other', 'KHR_gaussian_splatting.lod' in the document" in capsys.readouterr().err.replace("\n", " ")
+
+
+OFFICIAL = {
+    "a.ply": foreign.ply(rows(nx=0.0, ny=0.0, nz=0.0, red=1.0)), "flat.ply": foreign.ply(rows(scale_2=None)),
+    "packed.ply": foreign.compressed_ply(-1, 1),
+    "a.sog": foreign.sog(asset={"generator": "x"}, model="default", antialias=False),
+    "a.glb": foreign.glb(node={"name": "n", "extras": {"a": 1}}, document={"extras": {}, "materials": [], "cameras": []}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OFFICIAL)
+def test_official_fields_that_are_not_read_are_not_worth_a_word(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    read(OFFICIAL[name], name)
+    assert "passed over" not in capsys.readouterr().err
+
+
+ODD = "\x1b]0;t\x07" + "n" * 5000
+MANY = {f"field{number}": 1.0 for number in range(100)}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("a.ply", foreign.ply(rows(foo=1.0)), "passed over: 'foo' in element vertex, which"),
+        ("a.ply", foreign.ply(after=("element foo 1\nproperty float x", b"\0" * 4)), "passed over: 'foo' in the header, which"),
+        ("a.ply", foreign.ply(before=("element foo 1\nproperty float x", b"\0" * 4)), "passed over: 'foo' in the header, which"),
+        ("a.ply", foreign.ply(rows(**MANY)), "'field7' and 92 more in element vertex, which"),
+        ("a.ply", foreign.compressed_ply(-1, 1, more="state"), "passed over: 'state' in element vertex, which"),
+        ("a.sog", foreign.sog(**{ODD: 1}), r"passed over: '\x1b]0;t\x07nnnnnn"),
+        ("a.sog", foreign.sog(**MANY), "'field7' and 92 more in meta.json, which"),
+        ("a.glb", foreign.glb(node={"foo": 1}), "passed over: 'nodes.foo' in the document, which"),
+        ("a.glb", foreign.glb(document={ODD: 1, "foo": 2}), r"passed over: '\x1b]0;t\x07nnnnnn"),
+    ],
+)
+def test_fields_of_others_are_named_shortly(name: str, content: bytes, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    read(content, name)
+    said = [one for one in capsys.readouterr().err.splitlines() if "passed over" in one]
+    assert [line in one and len(one) < 700 and one.isprintable() for one in said] == [True]
 
 
 @pytest.mark.parametrize("model", ["gabor", 7, {"name": "x"}])

@@ -14,6 +14,7 @@ from pathlib import Path
 from mudg.base.types import Scene
 from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
+from mudg.data.unknown_fields import named_once
 
 Importer = Callable[[Path, Path, ImportOptions], Scene]
 Recogniser = Callable[[Path], bool]
@@ -80,7 +81,7 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 def _import(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
     from mudg.data.importers.common import foreign_numbers
 
-    with foreign_numbers():
+    with foreign_numbers(), named_once():
         return _functions(name)[1](source, out, options)
 
 

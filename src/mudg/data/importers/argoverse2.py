@@ -41,6 +41,7 @@ from mudg.data.importers.layout import (
     the_only,
 )
 from mudg.data.importers.options import ImportOptions
+from mudg.data.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 
@@ -61,6 +62,19 @@ NANOSECONDS: Final = 10**9
 _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+SWEEPS: Final = "sensors/lidar/*.feather"
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
+    "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
+    "intrinsics.feather": frozenset({
+        "sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px",
+    }),
+    "annotations.feather": frozenset({
+        "timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE, "num_interior_pts", "log_id",
+    }),
+    SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
+}  # fmt: skip
+"""Tables -> their columns."""
 
 LABELS: Final[Mapping[str, str]] = {
     "REGULAR_VEHICLE": "car", "PEDESTRIAN": "pedestrian", "OFFICIAL_SIGNALER": "pedestrian", "BICYCLE": "bicycle",
@@ -211,6 +225,8 @@ def read_feather(path: Path, columns: Sequence[str]) -> Columns:
             raise InputError("file not found", where=str(path), remedy="is the log complete?")
         table = pyarrow.feather.read_table(str(path), memory_map=False)
         require_columns(columns, table.schema.names, path)
+        kind = path.name if path.name in OFFICIAL else SWEEPS
+        note_unknown(kind, table.schema.names, OFFICIAL[kind])
         empty = [name for name in columns if table.column(name).null_count]
         if empty:
             raise InputError("table has rows without a value", where=f"{path}: {', '.join(empty)}")

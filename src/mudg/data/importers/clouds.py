@@ -11,7 +11,7 @@ import math
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
@@ -22,11 +22,21 @@ from numpy.typing import NDArray
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.data.scene.returns import is_return
+from mudg.data.unknown_fields import note_unknown
 
 MAX_POINTS: Final = 50_000_000
 _MAX_HEADER_BYTES: Final = 1 << 16
 _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
+
+USUAL: Final = frozenset({
+    "x", "y", "z", "intensity", "reflectivity", "reflectance", "remission", "i", "ring", "channel", "laser_id", "lidar_info", "line", "tag",
+    "t", "time", "timestamp", "time_stamp", "offset_time", "offset_ns", "range", "distance", "azimuth", "elevation", "ambient", "noise",
+    "near_ir", "signal", "return_type", "return_number", "number_of_returns", "confidence", "rgb", "rgba", "r", "g", "b", "a", "red",
+    "green", "blue", "alpha", "nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "curvature", "label", "class", "classification",
+    "instance", "object", "velocity", "doppler",
+})  # fmt: skip
+"""Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
 Fields = Mapping[str, NDArray]
 
@@ -43,8 +53,11 @@ class Cloud:
     missing: int
 
 
-def read_cloud(path: Path) -> Cloud:
+def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
     """Read a cloud by the suffix of its name.
+
+    Args:
+        known: names of fields that the caller reads, or knows to be there, besides ``USUAL``.
 
     Raises:
         InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not finite.
@@ -58,6 +71,7 @@ def read_cloud(path: Path) -> Cloud:
     if absent:
         raise InputError("cloud has no coordinates", where=str(path), expected="fields x, y, z",
             got=", ".join(columns) or "no fields")  # fmt: skip
+    note_unknown(f"*{path.suffix}", [name for name in columns if name.lower() not in USUAL], frozenset(known))
     xyz = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
     nowhere = ~is_return(xyz)
     xyz = xyz[~nowhere]

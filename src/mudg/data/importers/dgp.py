@@ -39,6 +39,7 @@ from mudg.data.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.data.importers.layout import LogFiles, chosen_cameras, folder_contents, path_inside, refuse_untwist, the_only
 from mudg.data.importers.options import ImportOptions
 from mudg.data.scene.returns import is_return
+from mudg.data.unknown_fields import Known, note_unknown, note_unknown_within
 
 Matrix = NDArray[np.float64]
 
@@ -47,6 +48,39 @@ MICROSECONDS: Final = 10**6
 _YEAR_2100_US: Final = 4_102_444_800 * MICROSECONDS
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _BOXES_3D: Final = "1"
+_POSE: Final[Known] = {"translation": dict.fromkeys("xyz"), "rotation": dict.fromkeys(("qw", "qx", "qy", "qz"))}
+_ID: Final[Known] = dict.fromkeys(("log", "name", "timestamp", "index"))
+_SCENE: Final[Known] = {
+    **dict.fromkeys(("name", "description", "log", "metadata", "creation_date", "ontologies", "agent_ontologies", "statistics")),
+    "samples": {**dict.fromkeys(("datum_keys", "calibration_key", "metadata")), "id": _ID},
+    "data": {
+        **dict.fromkeys(("key", "next_key", "prev_key")), "id": _ID,
+        "datum": {
+            "file_datum": None, "radar_point_cloud": None,
+            "image": {**dict.fromkeys(("filename", "height", "width", "channels", "annotations", "metadata")), "pose": _POSE},
+            "point_cloud": {**dict.fromkeys(("filename", "annotations", "metadata", "point_format", "point_fields")), "pose": _POSE},
+        },
+    },
+}  # fmt: skip
+_LENS: Final = (
+    "fx", "fy", "cx", "cy", "skew", "fov", "fisheye", *(f"k{number}" for number in range(1, 7)), "p1", "p2", "s1", "s2", "s3", "s4",
+    "taux", "tauy", "alpha", "beta", "w", "xi", "equirectangular",
+)  # fmt: skip
+_CHANNELS: Final = frozenset({
+    "X", "Y", "Z", "INTENSITY", "R", "G", "B", "RING", "NORMAL_X", "NORMAL_Y", "NORMAL_Z", "CLASS_ID", "INSTANCE_ID", "TIMESTAMP",
+})  # fmt: skip
+OFFICIAL: Final[Mapping[str, Known]] = {
+    "scene_*.json": _SCENE,
+    "calibration/*.json": {"names": None, "intrinsics": dict.fromkeys(_LENS), "extrinsics": _POSE},
+    "ontology/*.json": {"items": dict.fromkeys(("name", "id", "color", "isthing", "supercategory"))},
+    "bounding_box_3d/*.json": {
+        "annotations": {
+            **dict.fromkeys(("class_id", "instance_id", "attributes", "num_points")),
+            "box": {**dict.fromkeys(("width", "length", "height", "occlusion", "truncation")), "pose": _POSE},
+        },
+    },
+}  # fmt: skip
+"""Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's published messages."""
 LABELS: Final[Mapping[str, str]] = {
     "Car": "car", "Truck": "truck", "Bus/RV/Caravan": "bus", "Bus": "bus", "Motorcycle": "motorcycle",
     "Motorcyclist": "rider", "Bicycle": "bicycle", "Bicyclist": "rider", "Person": "pedestrian",
@@ -122,7 +156,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     """What the scene file, calibrations and box files tell; no image or cloud is opened."""
     folder, where = scene_file.parent, str(scene_file)
     log.info(f"dgp: {scene_file}")
-    scene = store.read_json(scene_file)
+    scene = _json(scene_file, "scene_*.json")
     with record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
         data = _read_data(scene, where)
         calibrations = {key: _read_calibration(folder, key) for key in sorted({d.calibration for d in data})}
@@ -157,6 +191,13 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     source = Source("dgp", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
     return DriveLog(name, ordered, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+
+
+def _json(path: Path, kind: str) -> Any:
+    """A file of the scene; fields that are not official are noted."""
+    content = store.read_json(path)
+    note_unknown_within(kind, content, OFFICIAL[kind])
+    return content
 
 
 def _read_data(scene: Mapping[str, Any], where: str) -> list[_Datum]:
@@ -228,7 +269,7 @@ class _DgpCalibration:
 
 def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
     path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
-    record = store.read_json(path)
+    record = _json(path, "calibration/*.json")
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
         raise InputError("calibration lists differ in length", where=str(path),
@@ -267,7 +308,7 @@ def _read_tracks(
         if not name:
             continue
         path = path_inside(folder, name, datum.where)
-        for index, item in enumerate(store.read_json(path)["annotations"]):
+        for index, item in enumerate(_json(path, "bounding_box_3d/*.json")["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
                 raise InputError("box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
@@ -283,7 +324,7 @@ def _read_tracks(
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
     key = scene["ontologies"].get(_BOXES_3D)
     path = path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
-    return {int(item["id"]): str(item["name"]) for item in store.read_json(path)["items"]}
+    return {int(item["id"]): str(item["name"]) for item in _json(path, "ontology/*.json")["items"]}
 
 
 def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
@@ -293,8 +334,11 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
         InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite.
     """
     where = str(path)
-    data = npz_arrays(store.read_bytes(path), where).get("data", np.zeros(0))
+    arrays = npz_arrays(store.read_bytes(path), where)
+    note_unknown("point_cloud/*.npz", arrays, frozenset({"data"}))
+    data = arrays.get("data", np.zeros(0))
     columns = [str(name).upper() for name in point_format] or ["X", "Y", "Z", "INTENSITY"]
+    note_unknown("point_format", columns, _CHANNELS)
     fits = data.ndim == 2 and data.shape[1] == len(columns) and data.dtype.kind in "fiu"
     if not fits or not {"X", "Y", "Z"} <= {*columns}:
         raise InputError("cloud does not have its columns", where=f"{where}: data", got=f"{data.dtype} {data.shape}",

@@ -6,7 +6,7 @@ import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -183,12 +183,6 @@ class BoundedZip:
             raise InputError("a file in the zip has another size than listed", where=where, expected=str(info.file_size),
                 got=str(len(content)))  # fmt: skip
         return content
-
-
-def listed(names: Iterable[str]) -> str:
-    """Names of a foreign file for a message: the first twelve, 40 printable characters each."""
-    every = ["".join(c if c.isprintable() else "?" for c in str(name))[:40] for name in names]
-    return ", ".join(every[:12]) + (f" and {len(every) - 12} more" if len(every) > 12 else "")
 
 
 # -- order and packing ---------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from mudg.base.errors import InputError
 from mudg.core.sh import C0
 from mudg.data.splats import binary, ply
 from mudg.data.splats.cloud import SplatCloud, SplatFile, checked, logit, spacing_m
+from mudg.data.unknown_fields import listed, sentence
 
 CHUNK: Final = 256
 _BOUNDS: Final = tuple(
@@ -95,7 +96,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     names = chunk.dtype.names or ()
     if len(chunk) != -(-len(vertex) // CHUNK) or any(name not in names for name in _BOUNDS[:12]):
         raise InputError("the chunks of the compressed PLY do not fit its vertices", where=where,
-            expected=f"{-(-len(vertex) // CHUNK)} chunks", got=f"{len(chunk)}: {binary.listed(names[:4])}, ...")  # fmt: skip
+            expected=f"{-(-len(vertex) // CHUNK)} chunks", got=f"{len(chunk)}: {listed(names[:4])}, ...")  # fmt: skip
     of_chunk = np.arange(len(vertex)) // CHUNK
     bounds = {name: chunk[name].astype(np.float64) for name in _BOUNDS if name in names}
     low, high = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3))
@@ -114,7 +115,10 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     columns = [values.astype(np.float32) for values in (quats, scales, logit(rgba[:, 3]), sh)]
     cloud = checked(SplatCloud(means, *columns, antialias=file.antialias), where)
     step = spacing_m(np.concatenate([low, high])) if chunk.dtype["min_x"].itemsize == 4 else 0.0
-    return SplatFile(cloud, file.axes, file.axes_by, step, file.notes, file.warnings)
+    known = {"chunk": _BOUNDS, "vertex": _PACKED, "sh": tuple(f"f_rest_{index}" for index in range(max(_REST)))}
+    unknown = {element: [n for n in table.dtype.names or () if n not in known[element]] for element, table in file.tables.items()}
+    notes = [sentence(names, f"element {element}") for element, names in unknown.items() if names]
+    return SplatFile(cloud, file.axes, file.axes_by, step, (*file.notes, *notes), file.warnings)
 
 
 def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
@@ -124,7 +128,7 @@ def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
     rest = tuple(f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in names)))
     if len(table) != count or len(rest) not in _REST or any(name not in names or table.dtype[name] != np.uint8 for name in rest):
         raise InputError("the harmonics of the compressed PLY do not fit its vertices", where=where,
-            expected=f"{count} rows of 9, 24 or 45 uchar", got=f"{len(table)} rows of {binary.listed(names)}")  # fmt: skip
+            expected=f"{count} rows of 9, 24 or 45 uchar", got=f"{len(table)} rows of {listed(names)}")  # fmt: skip
     raw = ply.columns_of(table, rest)
     values = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
     return ply.coefficient_major(((values - 0.5) * 8).astype(np.float32)).astype(np.float64)

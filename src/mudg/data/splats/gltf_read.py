@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from mudg.data.splats import binary
 from mudg.data.splats.axes import in_words
 from mudg.data.splats.cloud import LEAST_LOG, SplatCloud, SplatFile, checked, joined, logit, spacing_m, unit
 from mudg.data.splats.gltf import BIN_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, PREFIX
+from mudg.data.unknown_fields import listed, sentence
 
 _KINDS: Final = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -27,6 +28,21 @@ _LINEAR: Final = {
 }  # fmt: skip
 """Colour spaces and whether they are linear; the last two are names of the drafts."""
 _KIND: Final = ("kernel", "colorSpace", "projection", "sortingMethod", "extensions", "extras")
+_STANDARD: Final[Mapping[str, frozenset[str]]] = {
+    "": frozenset({
+        "accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensions", "extensionsRequired", "extensionsUsed",
+        "extras", "images", "materials", "meshes", "nodes", "samplers", "scene", "scenes", "skins", "textures",
+    }),
+    "nodes.": frozenset({
+        "camera", "children", "extensions", "extras", "matrix", "mesh", "name", "rotation", "scale", "skin", "translation", "weights",
+    }),
+    "primitives.": frozenset({"attributes", "extensions", "extras", "indices", "material", "mode", "targets"}),
+    "accessors.": frozenset({
+        "bufferView", "byteOffset", "componentType", "count", "extensions", "extras", "max", "min", "name", "normalized", "sparse", "type",
+    }),
+}  # fmt: skip
+"""Objects of glTF 2.0 -> their fields, read or not; ``extras`` belong to users."""
+_ATTRIBUTE: Final = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL)
 _ROUNDING: Final = 1e-3
 _MOST_JSON: Final = 64 << 20
 _DEPTH: Final = 32
@@ -59,7 +75,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if file.entries(file.document, "animations"):
         file.warnings["its animations are not read: everything is where the nodes put it at rest"] = None
     if file.passed:
-        file.notes[f"fields and extensions passed over: {binary.listed(sorted(file.passed))}"] = None
+        file.notes[sentence(sorted(file.passed), "the document")] = None
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
         file.warnings[f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF"] = None
@@ -120,12 +136,17 @@ class _GlbFile:
         extras = asset.get("extras")
         drawing = extras.get("drawing") if isinstance(extras, dict) else None
         self.antialias = isinstance(drawing, dict) and drawing.get("antialias") is True
+        self._note("", document)
         self._check_extensions()
         place = 20 + length
         if place < len(content):
             length, kind = binary.unpacked("<II", content, place, "the second chunk", where)
             if kind == BIN_CHUNK:
                 self.binary = binary.part(content, place + 8, length, "the binary chunk", where)
+
+    def _note(self, within: str, owner: dict[str, Any]) -> None:
+        """Note the fields of an object of the document that glTF does not have."""
+        self.passed.update(f"{within}{name}" for name in owner if name not in _STANDARD[within])
 
     def _check_extensions(self) -> None:
         """Refuse a file that cannot be read without extensions that are not known here; list those that it can be read without."""
@@ -136,7 +157,7 @@ class _GlbFile:
             unknown = [one for one in stated if one not in _READ]
             if unknown and name == "extensionsRequired":
                 raise InputError("the GLB file needs an extension that is not read", where=f"{self.where}: JSON",
-                    got=binary.listed(unknown), expected=", ".join(_READ), remedy="write the file without it, or as SPZ")  # fmt: skip
+                    got=listed(unknown), expected=", ".join(_READ), remedy="write the file without it, or as SPZ")  # fmt: skip
             self.passed.update(unknown)
 
     def of_old_transform(self, before: int) -> bool:
@@ -200,6 +221,7 @@ class _GlbFile:
                     "the nodes of the GLB file are no tree", where=f"{self.where}: JSON", got=f"node {index} twice"
                 )
             seen.add(index)
+            self._note("nodes.", node)
             matrix = matrix @ self._matrix(node)
             extensions = node.get("extensions")
             extensions = extensions if isinstance(extensions, dict) else {}
@@ -249,11 +271,13 @@ class _GlbFile:
         elif not isinstance(space, str) or space not in _LINEAR:
             raise InputError("the colour space of the Gaussians is not known", where=f"{self.where}: {EXTENSION}: colorSpace",
                 expected=", ".join(_LINEAR), got=repr(space)[:60], remedy="convert the colours to sRGB")  # fmt: skip
+        self._note("primitives.", primitive)
+        self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
         inner = kind.get("extensions")
         compressed = [name for name in inner if "compression" in name] if isinstance(inner, dict) else []
         if compressed:
             raise InputError("the Gaussians of the GLB file are compressed", where=f"{self.where}: {EXTENSION}",
-                got=binary.listed(compressed), expected="attributes without compression", remedy="write it without, or as SPZ")  # fmt: skip
+                got=listed(compressed), expected="attributes without compression", remedy="write it without, or as SPZ")  # fmt: skip
         self.passed.update(f"{EXTENSION}.{name}" for name in kind if name not in _KIND)
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
@@ -294,7 +318,7 @@ class _GlbFile:
         read = tuple(f"{PREFIX}SH_DEGREE_{d}_" for d in degrees)
         beyond = [name for name in attributes if name.startswith(f"{PREFIX}SH_DEGREE_") and not name.startswith(read)]
         if beyond:
-            self.warnings[f"harmonics beyond degree 3 were dropped: {binary.listed(beyond)}"] = None
+            self.warnings[f"harmonics beyond degree 3 were dropped: {listed(beyond)}"] = None
         self.step_m = max(self.step_m, spacing_m(means))
         quats, logs, logits, sh = (values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh))
         return checked(SplatCloud(means, quats, logs, logits, sh), self.where)
@@ -327,6 +351,7 @@ class _GlbFile:
                 got=", ".join(attributes)[:160],
             )
         accessor = self.entry("accessors", attributes[name])
+        self._note("accessors.", accessor)
         component = accessor.get("componentType")
         if component not in _KINDS or _WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
             raise InputError("an attribute of the Gaussians has the wrong type", where=f"{self.where}: {name}", expected=f"{width} numbers",
@@ -341,7 +366,7 @@ class _GlbFile:
         buffers = self.entries(self.document, "buffers")
         if view.get("buffer", 0) != 0 or packed or (buffers and "uri" in buffers[0]):
             raise InputError("an attribute of the Gaussians lies outside the file, or is compressed", where=f"{self.where}: {name}",
-                expected="the binary chunk", got=f"buffer {view.get('buffer', 0)!r:.20}, extensions {binary.listed(packed or ())}",
+                expected="the binary chunk", got=f"buffer {view.get('buffer', 0)!r:.20}, extensions {listed(packed or ())}",
                 remedy="pack the file with its buffers, without compression")  # fmt: skip
         stride = self.number(view, "byteStride", 0) or width * dtype.itemsize
         begins, inner = self.number(view, "byteOffset", 0), self.number(accessor, "byteOffset", 0)

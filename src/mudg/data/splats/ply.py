@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError
 from mudg.data.splats import binary
 from mudg.data.splats.axes import VERTICAL, known
-from mudg.data.splats.binary import listed
 from mudg.data.splats.cloud import SplatCloud, SplatFile, checked, logit, spacing_m
+from mudg.data.unknown_fields import listed, sentence
 
 MAX_HEADER: Final = 1 << 16
 MOST_LISTS: Final = 2_000_000
@@ -37,6 +37,12 @@ FLAT_LOG: Final = float(np.log(1e-6))
 _MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
 _MOTION: Final = ("trbf", "motion", "omega", "t_", "time", "scale_t", "scaling_t", "rot_r", "rotation_r", "velocity", "duration")
 """Beginnings of columns with which methods for moving scenes move their Gaussians."""
+_UNREAD: Final = ("nx", "ny", "nz", "red", "green", "blue", "alpha")
+_ELEMENTS: Final = (
+    "face", "edge", "tristrips", "material", "camera", "extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space",
+    "version",
+)  # fmt: skip
+"""Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed list."""
 _TYPES: Final = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
@@ -105,7 +111,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if filters:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
         notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
-    used = {*wanted, *_indexed("f_rest", rest), "nx", "ny", "nz", *filters, *(["class"] if ours else [])}
+    used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
     passed = [name for name in names if name not in used]
     moving = [name for name in passed if name.lower().startswith(_MOTION)]
     warnings = list(file.warnings)
@@ -114,7 +120,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if moving:
         warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
     if len(passed) > len(moving):
-        notes.append(f"columns passed over: {listed([name for name in passed if name not in moving])}")
+        notes.append(sentence([name for name in passed if name not in moving], "element vertex"))
     single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
     step = spacing_m(means[:, single]) if single else 0.0
     return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
@@ -211,7 +217,7 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
             tables[element.name] = np.frombuffer(rows, dtype)
         place += size
     more = [element.name for element in elements if element.name not in wanted and element.count]
-    notes, warnings = ([f"elements passed over: {listed(more)}"] if more else []), list[str]()
+    unknown, warnings = [name for name in more if name not in _ELEMENTS], list[str]()
     antialias = _antialias(comments, warnings)
     axes, by = _axes(comments, warnings)
     offset = next((line for line in comments if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line)), "")
@@ -220,7 +226,7 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
         warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
     if offset:
         warnings.append(f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)")
-    return PlyFile(tables, antialias, axes, by, tuple(notes), tuple(warnings))
+    return PlyFile(tables, antialias, axes, by, (sentence(unknown, "the header"),) if unknown else (), tuple(warnings))
 
 
 def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str], int, str]:

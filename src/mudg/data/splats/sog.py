@@ -25,6 +25,7 @@ from mudg.base.errors import InputError
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.data.splats import binary
 from mudg.data.splats.cloud import SplatCloud, SplatFile, checked, logit
+from mudg.data.unknown_fields import listed, sentence
 
 CODES: Final = 256
 MAX_PALETTE: Final = 65536
@@ -199,7 +200,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     archive = binary.BoundedZip(content, where)
     names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
     if not names:
-        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=binary.listed(archive.names) or "an empty zip",
+        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=listed(archive.names) or "an empty zip",
             remedy="of a bundle, give the PLY files within" if "bundle.json" in archive.names else "")  # fmt: skip
     folder = names[0].removesuffix("meta.json")
     stated = store.parse_json(archive.read(names[0], _MOST_META), f"{where}: {names[0]}")
@@ -232,7 +233,7 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     antialias = meta.model == "antialiased" if meta.model is not None else bool(meta.antialias)
     cloud = checked(SplatCloud(means, *columns, antialias=antialias), where)
     unknown = meta.unknown()
-    notes = (f"fields of meta.json passed over: {binary.listed(unknown)}",) if unknown else ()
+    notes = (sentence(unknown, "meta.json"),) if unknown else ()
     warnings = [] if meta.model in _MODELS else [f"its model {str(meta.model)[:40]!r} is not known: drawn as usual"]
     if pixels.lossy:
         warnings.append("its pictures are compressed with loss, so that values are wrong: write them without")

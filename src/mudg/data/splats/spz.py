@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError, ResourceError
 from mudg.data.splats import binary
 from mudg.data.splats.cloud import Floats, SplatCloud, SplatFile, checked, logit, spacing_m
+from mudg.data.unknown_fields import listed
 
 MAGIC: Final = 0x5053474E
 BITS: Final = 12
@@ -178,7 +179,7 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
         notes.append("it does not state its axes: read with y up, as the format says; if it stands on its head, add --axes RDF")
     unknown = [f"{kind:#010x} ({len(part)} bytes)" for kind, part in extensions.items() if kind != _AXES and kind not in _HARMLESS]
     if unknown:
-        warnings.append(f"extensions that are not known were passed over: {binary.listed(unknown)}")
+        warnings.append(f"extensions that are not known were passed over: {listed(unknown)}")
     if head.flags & ~(_ANTIALIAS | _EXTENSIONS):
         warnings.append(f"flags that are not known were passed over: {head.flags:#x}")
     if head.degree > 3:

@@ -17,6 +17,7 @@ from mudg.base.types import Track
 from mudg.data.importers.box_tracks import BoxTracks, box_size
 from mudg.data.importers.kitti.poses import read_lines
 from mudg.data.importers.kitti.scans import azimuth_delay_s
+from mudg.data.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
@@ -24,6 +25,12 @@ LABELS = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
 )
 """Classes of the benchmarks, in lower case."""
+_TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
+_TRACKLET_POSE = frozenset({
+    "tx", "ty", "tz", "rx", "ry", "rz", "state", "occlusion", "occlusion_kf", "truncation", "amt_occlusion", "amt_occlusion_kf",
+    "amt_border_l", "amt_border_r", "amt_border_kf",
+})  # fmt: skip
+"""Fields of the data set's tracklets, read or not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,12 +113,14 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     boxes = []
     for track, item in enumerate(root.findall("./tracklets/item")):
         where = f"{path}: tracklet {track}"
+        note_unknown(path.name, [field.tag for field in item], _TRACKLET)
         length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
         size_m = box_size(length, width, height, where)
         first = int(_xml_number(item, "first_frame", where))
         label = (item.findtext("objectType") or "").strip().lower()
         for step, pose in enumerate(item.findall("./poses/item")):
             here = f"{where} pose {step}"
+            note_unknown(path.name, [field.tag for field in pose], _TRACKLET_POSE)
             tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
             boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
     return boxes

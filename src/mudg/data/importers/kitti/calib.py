@@ -19,9 +19,22 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert
 from mudg.base.types import Camera
 from mudg.data.importers.common import rigid_pose, rigid_rotation
+from mudg.data.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 PIXEL_CENTRE_PX = 0.5
+_NUMBERED = tuple(f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4))
+_TEXT = frozenset({
+    "P0", "P1", "P2", "P3", "R0_rect", "R_rect", "Tr", "Tr_velo_to_cam", "Tr_velo_cam", "Tr_imu_to_velo", "Tr_imu_velo", "calib_time",
+})  # fmt: skip
+_OFFICIAL: Mapping[str, frozenset[str]] = {
+    "calib_cam_to_cam.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
+    "calib_velo_to_cam.txt": frozenset({"calib_time", "R", "T", "delta_f", "delta_c"}),
+    "calib_imu_to_velo.txt": frozenset({"calib_time", "R", "T"}),
+    "perspective.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
+    "calib_cam_to_pose.txt": frozenset({"image_00", "image_01", "image_02", "image_03"}),
+}
+"""Entries of the data sets' files, read or not; any other file is the calibration text of an object, a sequence or a drive."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +105,7 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
         match = re.match(r"\s*([A-Za-z][\w]*)\s*:?\s+(.*)$", line)
         if match is None:
             continue
+        note_unknown(path.name, (match[1],), _OFFICIAL.get(path.name, _TEXT))
         try:
             numbers = np.array([float(text) for text in match[2].split()])
         except ValueError:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation
+from mudg.data.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 LABEL_OF_ID: Final = {
@@ -34,6 +35,11 @@ LABEL_OF: Final = {
     "rider": "cyclist", "unknown vehicle": "vehicle",
 }  # fmt: skip
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
+_OFFICIAL: Final = frozenset({
+    "index", "label", "category", "semanticId", "semanticId_orig", "instanceId", "timestamp", "start_frame", "end_frame", "dynamic",
+    "dynamicSeq", "dynamicIdx", "dynamicIndex", "level_min", "level_max", "color", "transform", "vertices", "faces",
+})  # fmt: skip
+"""Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
 MAX_FILE_BYTES: Final = 8 * 1024**3
 _CHUNK: Final = 1 << 20
@@ -76,6 +82,7 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
             continue
+        note_unknown(path.name, [field.tag for field in item], _OFFICIAL)
         label = _label(item, where)
         if label not in LABEL_OF:
             left_out["of classes that do not move"] += 1

@@ -23,6 +23,7 @@ from mudg.data.importers.images import ImageFit, brown_conrady, fit_images
 from mudg.data.importers.kitti.calib import pinhole_camera, read_number_table, table_entry
 from mudg.data.importers.kitti.poses import line_numbers
 from mudg.data.importers.options import ImportOptions
+from mudg.data.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -31,6 +32,10 @@ FISHEYE_VIEW_DEG: Final = 90.0
 _FISHEYE_VALUES: Final = (
     "image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0",
 )  # fmt: skip
+_FISHEYE: Final = frozenset({
+    *_FISHEYE_VALUES, "model_type", "camera_name", "mirror_parameters", "distortion_parameters", "projection_parameters",
+})  # fmt: skip
+"""Entries of the data set's fisheye calibrations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,6 +140,7 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     if model is None or model[1] != "MEI":
         raise InputError("fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
             got=model[1] if model else "no model_type")  # fmt: skip
+    note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
         try:

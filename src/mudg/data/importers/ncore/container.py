@@ -11,7 +11,7 @@ from __future__ import annotations
 import lzma
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ import numpy as np
 from mudg.base import memory, store
 from mudg.base.errors import InputError, MudgError
 from mudg.data.importers.columns import record_fields
+from mudg.data.unknown_fields import note_unknown
 
 METADATA: Final = ".zmetadata.cbor.xz"
 _BLOCK: Final = 512
@@ -36,6 +37,10 @@ _CONTAINER_BYTES: Final = 72
 _MOST_LZ4: Final = 256
 _BLOSC_HEADER: Final = struct.Struct("<4B3I")
 _KINDS: Final = "biufS"
+COMPONENTS: Final = frozenset({
+    "poses", "intrinsics", "masks", "cameras", "lidars", "radars", "cuboids", "point_clouds", "camera_labels",
+})  # fmt: skip
+"""Components of the format, read or not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,8 @@ def check_store(path: Path) -> None:
     with record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
         chunks = _chunk_sizes(members)
+        groups = dict.fromkeys(name.partition("/")[0] for name in metadata if "/" in name)
+        note_unknown("the stores of the recording", groups, COMPONENTS)
         for name, about in metadata.items():
             if name.endswith(".zarray"):
                 place = name.removesuffix(".zarray")
@@ -185,10 +192,10 @@ def _chunk_sizes(members: Mapping[str, _StoredMember]) -> dict[str, dict[str, _S
 
 def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], where: str) -> None:
     """Refuse an array that its chunks cannot fill, that is not of plain numbers or bytes, or that is packed in another way."""
-    codec = about["compressor"]
-    if about.get("filters") or not (codec is None or codec["id"] == "blosc"):
-        raise InputError("array is packed in a way that is not read", where=where, expected="blosc or nothing",
-            got=str(codec if not about.get("filters") else about["filters"])[:120])  # fmt: skip
+    codec, nested = about["compressor"], about.get("dimension_separator", ".") != "."
+    if nested or about.get("filters") or not (codec is None or codec["id"] == "blosc"):
+        raise InputError("array is packed in a way that is not read", where=where, expected="blosc or nothing, chunks named 0.0",
+            got=str(about.get("filters") or (about["dimension_separator"] if nested else codec))[:120])  # fmt: skip
     kind = np.dtype(about["dtype"])
     if kind.hasobject or kind.kind not in _KINDS:
         raise InputError("array is not of plain numbers or bytes", where=where, got=str(about["dtype"])[:80])
@@ -197,6 +204,11 @@ def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], 
         raise InputError(
             "array has a shape that makes no sense", where=where, got=f"{shape} in chunks of {pieces}"[:120]
         )
+    grid = [-(-side // piece) for side, piece in zip(shape, pieces, strict=True)]
+    names = (".".join(map(str, place)) or "0" for place in (_places(grid) if math.prod(shape) else ()))
+    if (lost := next((name for name in names if name not in chunks), None)) is not None:  # the package would fill it with a constant
+        raise InputError("chunk of an array is missing", where=f"{where}/{lost}", expected=f"chunks of {pieces} for {shape}"[:120],
+            got=f"{len(chunks)} chunks", remedy="copy the recording again")  # fmt: skip
     stored, growth = sum(chunk.size for chunk in chunks.values()), 1 if codec is None else _MOST_LZ4
     piece = math.prod(pieces) * kind.itemsize
     if max(math.prod(shape) * kind.itemsize, piece if math.prod(shape) else 0) > growth * stored:
@@ -207,6 +219,14 @@ def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], 
         if size != piece:
             raise InputError("chunk of an array is of another size", where=f"{where}/{name}", expected=f"{piece} bytes", got=f"{size}",
                 remedy="copy the file again")  # fmt: skip
+
+
+def _places(grid: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    """Indices of a grid of chunks one by one: a file may promise more of them than memory holds."""
+    for first in range(grid[0]) if grid else ():
+        yield from ((first, *rest) for rest in _places(grid[1:]))
+    if not grid:
+        yield ()
 
 
 def _blosc_size(chunk: _StoredMember, where: str) -> int:

@@ -51,7 +51,13 @@ from mudg.data.ncore import (
     package,
     rotation_of,
 )
+from mudg.data.unknown_fields import Known, note_unknown_within
 
+_LIST: Final[Known] = {
+    **dict.fromkeys(("sequence_id", "sequence_timestamp_interval_us", "generic_meta_data", "version")),
+    "component_stores": dict.fromkeys(("path", "md5", "components")),
+}  # fmt: skip
+"""Fields of the list of a recording's stores."""
 UNKNOWN_LICENCE: Final = "not stated in the recording: see where it comes from"
 LABELS: Final[Mapping[str, str]] = {
     "automobile": "car", "heavy_truck": "truck", "train_or_tram_car": "tram", "other_vehicle": "vehicle", "person": "pedestrian",
@@ -136,7 +142,9 @@ def _is_list(path: Path) -> bool:
 def _listed(path: Path) -> list[Path]:
     """The stores that a ``.json`` names."""
     with record_fields("list of stores makes no sense", path, "component_stores with a path each"):
-        names = [one["path"] for one in store.read_json(path)["component_stores"]]
+        content = store.read_json(path)
+        note_unknown_within(path.name, content, _LIST)
+        names = [one["path"] for one in content["component_stores"]]
         return [
             path_inside(path.parent, name, f"{path}: component_stores[{index}]") for index, name in enumerate(names)
         ]

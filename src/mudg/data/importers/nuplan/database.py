@@ -25,6 +25,7 @@ from mudg.data.importers.common import pose_from_quaternion
 from mudg.data.importers.layout import path_inside
 from mudg.data.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 from mudg.data.scene.schema import ref_problem
+from mudg.data.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
@@ -40,6 +41,24 @@ SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
     "scene": ("token", "name"),
 }
 """Tables and columns that are read."""
+_XYZ: Final = ("x", "y", "z")
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "log": frozenset({"vehicle_name", "date", "timestamp", "map_version"}),
+    "ego_pose": frozenset({
+        "log_token", "epsg", *(f"{name}{axis}" for name in ("v", "acceleration_", "angular_rate_") for axis in _XYZ),
+    }),
+    "camera": frozenset({"log_token", "model"}),
+    "image": frozenset({"next_token", "prev_token", "ego_pose_token"}),
+    "lidar": frozenset({"log_token", "model"}),
+    "lidar_pc": frozenset({"next_token", "prev_token"}),
+    "lidar_box": frozenset({"token", "next_token", "prev_token", "vx", "vy", "vz", "confidence"}),
+    "track": frozenset({"width", "length", "height"}),
+    "category": frozenset({"description"}),
+    "scene": frozenset({"log_token", "goal_ego_pose_token", "roadblock_ids"}),
+    "scenario_tag": frozenset(),
+    "traffic_light_status": frozenset(),
+}  # fmt: skip
+"""Tables of the published schema, and those of their columns that are not read."""
 _MAX_CELL_BYTES: Final = 1024 * 1024
 """Calibrations are the longest values, of a few hundred bytes."""
 _MAX_TOKEN_BYTES: Final = 64
@@ -102,6 +121,8 @@ class NuplanLog:
                     got=", ".join(sorted(tables)) or "no tables", remedy="is it a nuPlan log (v1.1)?")  # fmt: skip
             there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
             require_columns(columns, there, f"{self.path}: {table}")
+            note_unknown(f"the table {table}", there, OFFICIAL[table].union(columns))
+        note_unknown("the database", [name for name in tables if not name.startswith("sqlite_")], frozenset(OFFICIAL))
 
     def name(self) -> str:
         """The log's name, e.g. ``2021.05.12.22.00.38_veh-35_01008_01518``."""

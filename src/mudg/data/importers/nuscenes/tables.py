@@ -11,12 +11,13 @@ import functools
 import itertools
 import json
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.data.unknown_fields import note_unknown
 
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
@@ -27,6 +28,30 @@ _RECORD: Final = functools.reduce(lambda inner, _: _FLAT_RECORD.replace(rb')*+\}
 _FLAT: Final = re.compile(_FLAT_RECORD, re.DOTALL)
 _ENTRY: Final = re.compile(rb"\s*+(,?)\s*+(" + _RECORD + rb"|\])", re.DOTALL)
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
+
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "attribute.json": frozenset({"token", "name", "description"}),
+    "calibrated_sensor.json": frozenset({"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}),
+    "category.json": frozenset({"token", "name", "description", "index"}),
+    "ego_pose.json": frozenset({"token", "timestamp", "translation", "rotation"}),
+    "instance.json": frozenset({
+        "token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token",
+    }),
+    "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
+    "sample_annotation.json": frozenset({
+        "token", "sample_token", "instance_token", "attribute_tokens", "visibility_token", "translation", "size", "rotation",
+        "num_lidar_pts", "num_radar_pts", "next", "prev",
+    }),
+    "sample_data.json": frozenset({
+        "token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "fileformat", "width", "height", "timestamp",
+        "is_key_frame", "next", "prev",
+    }),
+    "scene.json": frozenset({
+        "token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token",
+    }),
+    "sensor.json": frozenset({"token", "channel", "modality"}),
+}  # fmt: skip
+"""Tables that are read -> their fields. Source: the release's published schema; ``index`` came with nuScenes-lidarseg."""
 
 Row = dict[str, Any]
 
@@ -54,7 +79,7 @@ def iter_records(path: Path, *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[R
                 return
             if entry[2] == b"]" or first == bool(entry[1]):
                 raise _no_records(path, offset + position, entry[0])
-            yield _parse(entry[2], f"{path}: byte {offset + entry.start(2)}")
+            yield _parse(entry[2], path, offset + entry.start(2))
             first, position = False, entry.end()
 
 
@@ -99,7 +124,7 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
                     record = _FLAT.match(buffer, max(0, buffer.rfind(b"{", 0, match.start())))
                     if record is None or record.end() <= match.start():
                         raise _Unclear
-                    yield _parse(record[0], f"{path}: byte {offset + record.start()}")
+                    yield _parse(record[0], path, offset + record.start())
             if not piece and not buffer.rstrip().endswith(b"]"):
                 raise _cut_off(path)
             if len(buffer) - end > _MAX_RECORD_BYTES + buffer_bytes:
@@ -107,11 +132,13 @@ def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) 
             buffer, offset = buffer[end:], offset + end
 
 
-def _parse(content: bytes, where: str) -> Row:
+def _parse(content: bytes, path: Path, byte: int) -> Row:
     try:
         record = json.loads(content, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
-        raise InputError("table record is not valid JSON", where=where, got=str(error)) from error
+        raise InputError("table record is not valid JSON", where=f"{path}: byte {byte}", got=str(error)) from error
+    if path.name in OFFICIAL:
+        note_unknown(path.name, record, OFFICIAL[path.name])
     return record
 
 

@@ -56,6 +56,7 @@ from mudg.data.importers.layout import LogFiles
 from mudg.data.importers.options import ImportOptions
 from mudg.data.importers.pandaset.pandas_frame import read_frame
 from mudg.data.importers.pandaset.point_classes import PointClasses
+from mudg.data.unknown_fields import Known, note_unknown, note_unknown_within
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
@@ -91,6 +92,17 @@ _CUBOID_COLUMNS: Final = (
     "uuid", "label", "yaw", "stationary", "position.x", "position.y", "position.z",
     "dimensions.x", "dimensions.y", "dimensions.z",
 )  # fmt: skip
+_POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    _POINTS: frozenset(_POINT_COLUMNS),
+    _CUBOIDS: frozenset({
+        *_CUBOID_COLUMNS, "camera_used", "attributes.object_motion", "attributes.rider_status", "attributes.pedestrian_behavior",
+        "attributes.pedestrian_age", "cuboids.sibling_id", "cuboids.sensor_id",
+    }),
+    "intrinsics.json": frozenset({"fx", "fy", "cx", "cy"}),
+}  # fmt: skip
+"""Kinds of files -> their fields, read or not."""
+_POSE_FIELDS: Final[Known] = {"heading": dict.fromkeys("wxyz"), "position": dict.fromkeys("xyz")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,6 +359,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
         with record_fields("pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"):
             heading = [entry["heading"][key] for key in "wxyz"]
             poses.append(pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
+        note_unknown_within(_POSES, entry, _POSE_FIELDS)
     return np.stack(poses)
 
 
@@ -355,6 +368,7 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
     values = store.read_json(path)
     with record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        note_unknown(path.name, values, OFFICIAL[path.name])
     # the data set counts pixels from the centre of the top-left one, as OpenCV does
     return fit_images(Camera(name, *image_size(image), fx, fy, cx + 0.5, cy + 0.5), options)
 
@@ -362,9 +376,10 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
 # --- points -----------------------------------------------------------------------------------------------------------
 
 
-def _columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[Any]]:
     frame = read_frame(path)
     require_columns(names, frame, path)
+    note_unknown(kind, frame, OFFICIAL[kind])
     return frame
 
 
@@ -392,7 +407,7 @@ class _Cloud:
 
 def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     frame_s = float(motion.raw_s[index])
-    frame = _columns(path, _POINT_COLUMNS)
+    frame = _columns(path, _POINT_COLUMNS, _POINTS)
     returns = returns_of(frame, path)
     without = {d: int((frame["d"][~returns] == d).sum()) for d in SENSORS}
     frame = {name: values[returns] for name, values in frame.items()}
@@ -416,7 +431,7 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
 
 
 def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
-    frame = _columns(path, _CUBOID_COLUMNS)
+    frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
     centre = finite_columns(frame, ("position.x", "position.y", "position.z"), path)
     sizes = finite_columns(frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path)  # length, width, height
     yaw = finite_columns(frame, ("yaw",), path)[:, 0]

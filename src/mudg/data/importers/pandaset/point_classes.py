@@ -15,6 +15,7 @@ from mudg.data.importers import layout
 from mudg.data.importers.columns import finite_columns, require_columns
 from mudg.data.importers.options import ImportOptions
 from mudg.data.importers.pandaset.pandas_frame import read_frame
+from mudg.data.unknown_fields import note_unknown
 
 CLASS_OF: Final[dict[str, str]] = {
     "Smoke": "", "Exhaust": "", "Spray or rain": "",  # no surface
@@ -79,6 +80,7 @@ class PointClasses:
             return None
         table = read_frame(path)
         require_columns(("class",), table, path)
+        note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
         numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
             raise InputError("classes do not fit the points", where=f"{path}: class", got=f"{len(numbers)} rows",

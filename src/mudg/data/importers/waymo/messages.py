@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base.errors import InputError
+from mudg.data.unknown_fields import note_unknown
 
 Kind = Literal["int", "float", "double", "bytes", "text", "message", "doubles", "floats", "ints", "messages"]
 
@@ -40,10 +41,11 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message description: its name, for errors, and field number -> field."""
+    """A message description: its name, for errors; field number -> field; and numbers of the data set's fields that are not kept."""
 
     name: str
     fields: Mapping[int, Field]
+    passed: frozenset[int] = frozenset()
 
 
 def parse_message(data: bytes | memoryview, message: Message, where: str) -> dict[str, Any]:
@@ -69,6 +71,8 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
     for start, number, wire, raw in reader.fields():
         field = message.fields.get(number)
         if field is None:
+            if number not in message.passed:
+                note_unknown(f"{message.name} messages", (f"field {number}",), frozenset())
             continue
         packed = wire == _BYTES and field.kind in ("doubles", "floats", "ints")
         if wire != _WIRE[field.kind] and not packed:
@@ -185,9 +189,10 @@ def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
 # --- the messages of the data set -----------------------------------------------------------------------------------
 
 
-def _message(title: str, /, **fields: tuple[Any, ...]) -> Message:
-    """A description from fields by name: number, kind and, for messages, their description."""
-    return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()})
+def _message(title: str, /, *passed: int, **fields: tuple[Any, ...]) -> Message:
+    """A description from fields by name: number, kind and, for messages, their description. ``passed``: numbers of official fields that are
+    not kept."""
+    return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()}, frozenset(passed))
 
 
 _TRANSFORM = _message("Transform", values=(1, "doubles"))
@@ -199,7 +204,7 @@ _LASER_CALIBRATION = _message(
     "LaserCalibration", name=(1, "int"), inclinations=(2, "doubles"), inclination_min=(3, "double"),
     inclination_max=(4, "double"), extrinsic=(5, "message", _TRANSFORM)
 )  # fmt: skip
-_STATS = _message("Stats", time_of_day=(2, "text"), location=(3, "text"), weather=(4, "text"))
+_STATS = _message("Stats", 1, 5, time_of_day=(2, "text"), location=(3, "text"), weather=(4, "text"))
 CONTEXT: Final = _message(
     "Context", name=(1, "text"), cameras=(2, "messages", _CAMERA_CALIBRATION),
     lasers=(3, "messages", _LASER_CALIBRATION), stats=(4, "message", _STATS)
@@ -208,21 +213,21 @@ _VELOCITY = _message(
     "Velocity", v_x=(1, "float"), v_y=(2, "float"), v_z=(3, "float"), w_x=(4, "double"), w_y=(5, "double"),
     w_z=(6, "double")
 )  # fmt: skip
-_PANOPTIC = _message("CameraSegmentationLabel", divisor=(1, "int"), png=(2, "bytes"))
+_PANOPTIC = _message("CameraSegmentationLabel", 3, 4, 5, divisor=(1, "int"), png=(2, "bytes"))
 _CAMERA_IMAGE = _message(
     "CameraImage", name=(1, "int"), image=(2, "bytes"), pose=(3, "message", _TRANSFORM),
     velocity=(4, "message", _VELOCITY), pose_time_s=(5, "double"), shutter_s=(6, "double"), trigger_s=(7, "double"),
     done_s=(8, "double"), panoptic=(10, "message", _PANOPTIC)
 )  # fmt: skip
-_RANGE_IMAGE = _message("RangeImage", ranges=(2, "bytes"), projections=(3, "bytes"), poses=(4, "bytes"))
+_RANGE_IMAGE = _message("RangeImage", 1, 5, 6, ranges=(2, "bytes"), projections=(3, "bytes"), poses=(4, "bytes"))
 _LASER = _message("Laser", name=(1, "int"), return1=(2, "message", _RANGE_IMAGE), return2=(3, "message", _RANGE_IMAGE))
 _BOX = _message(
     "Box", x=(1, "double"), y=(2, "double"), z=(3, "double"), width=(4, "double"), length=(5, "double"),
     height=(6, "double"), heading=(7, "double")
 )  # fmt: skip
-_LABEL = _message("Label", box=(1, "message", _BOX), type=(3, "int"), id=(4, "text"))
+_LABEL = _message("Label", 2, 5, 6, 7, 8, 9, 10, 11, 12, 13, box=(1, "message", _BOX), type=(3, "int"), id=(4, "text"))
 FRAME: Final = _message(
-    "Frame", context=(1, "bytes"), timestamp_us=(2, "int"), pose=(3, "message", _TRANSFORM),
+    "Frame", 7, 8, 9, 10, 11, context=(1, "bytes"), timestamp_us=(2, "int"), pose=(3, "message", _TRANSFORM),
     images=(4, "messages", _CAMERA_IMAGE), lasers=(5, "messages", _LASER), labels=(6, "messages", _LABEL)
 )  # fmt: skip
 _SHAPE = _message("MatrixShape", dims=(1, "ints"))

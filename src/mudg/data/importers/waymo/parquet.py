@@ -18,6 +18,7 @@ from mudg.base.errors import InputError
 from mudg.data.importers.columns import arrow_files, require_columns
 from mudg.data.importers.waymo import records
 from mudg.data.importers.waymo.records import CAMERAS, LASERS, FrameRecord, LaserScan
+from mudg.data.unknown_fields import note_unknown
 
 _SEGMENT: Final = "key.segment_context_name"
 _TIME: Final = "key.frame_timestamp_micros"
@@ -31,6 +32,34 @@ _EXPOSURE: Final = tuple(
 )
 _BOX: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
 _STREAM_BYTES: Final = 1 << 20
+_TWO_RETURNS: Final = tuple(f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape"))
+OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
+    "camera_image": ("CameraImageComponent", ("image", "pose.transform", "pose_timestamp", *_VELOCITY, *_EXPOSURE)),
+    "camera_calibration": ("CameraCalibrationComponent", (
+        *(f"intrinsic.{name}" for name in _INTRINSIC), "extrinsic.transform", "width", "height", "rolling_shutter_direction",
+    )),
+    "camera_segmentation": ("CameraSegmentationLabelComponent", (
+        "panoptic_label", "panoptic_label_divisor", "sequence_id", "num_cameras_covered",
+        *(f"instance_id_to_global_id_mapping.{name}" for name in ("local_instance_ids", "global_instance_ids", "is_tracked")),
+    )),
+    "lidar": ("LiDARComponent", _TWO_RETURNS),
+    "lidar_box": ("LiDARBoxComponent", (
+        "type", *_BOX, *(f"{name}.{axis}" for name in ("speed", "acceleration") for axis in "xyz"), "num_lidar_points_in_box",
+        "num_top_lidar_points_in_box", "difficulty_level.detection", "difficulty_level.tracking",
+    )),
+    "lidar_calibration": ("LiDARCalibrationComponent", (
+        "extrinsic.transform", *(f"beam_inclination.{name}" for name in ("min", "max", "values")),
+    )),
+    "lidar_camera_projection": ("LiDARCameraProjectionComponent", _TWO_RETURNS),
+    "lidar_pose": ("LiDARPoseComponent", _TWO_RETURNS[:2]),
+    "stats": ("StatsComponent", (
+        "time_of_day", "location", "weather", *(f"{of}_object_counts.{part}" for of in ("lidar", "camera") for part in ("types", "counts")),
+    )),
+    "vehicle_pose": ("VehiclePoseComponent", ("world_from_vehicle.transform",)),
+}  # fmt: skip
+"""Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published components."""
+_KEYS: Final = (_SEGMENT, _TIME, _CAMERA, _LASER, _OBJECT, "index", "__index_level_0__")
+"""Columns that every table may have; the last two are the index of pandas."""
 
 REQUIRED: Final = ("camera_image", "camera_calibration", "vehicle_pose")
 """Components without which there is no scene."""
@@ -170,7 +199,11 @@ class ParquetLog:
 
     def _table(self, component: str) -> ParquetTable | None:
         path = self._root / component / f"{self.name}.parquet"
-        return ParquetTable(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        table, (prefix, columns) = ParquetTable(path), OFFICIAL[component]
+        note_unknown(f"{component}/*.parquet", table.names, frozenset({*_KEYS, *(f"[{prefix}].{name}" for name in columns)}))
+        return table
 
     def _need(self, component: str) -> ParquetTable:
         table = self._table(component)
@@ -215,7 +248,7 @@ class ParquetTable:
             from pyarrow.parquet import ParquetFile
 
             self._file = ParquetFile(store.regular(path), buffer_size=_STREAM_BYTES, pre_buffer=False, page_checksum_verification=True)
-        self._names = set(self._file.schema_arrow.names)
+        self.names: tuple[str, ...] = tuple(self._file.schema_arrow.names)
         counts = [self._file.metadata.row_group(n).num_rows for n in range(self._file.num_row_groups)]
         self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         self._by_time: dict[str, dict[int, list[tuple[str, int]]]] = {}
@@ -233,7 +266,7 @@ class ParquetTable:
 
     def columns(self, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
         """Whole columns as lists of plain values; None may stand in the ``optional`` ones only."""
-        require_columns((*names, *optional), self._names, self.path)
+        require_columns((*names, *optional), self.names, self.path)
         with arrow_files(self.path):
             found = self._file.read(columns=[*names, *optional])
             empty = [name for name in names if found.column(name).null_count]
@@ -272,7 +305,7 @@ class ParquetTable:
 
     def _row(self, row: int, names: tuple[str, ...]) -> Any:
         """One row of some columns. Going forward goes on where the last call stopped; going back starts a row group anew."""
-        require_columns(names, self._names, self.path)
+        require_columns(names, self.names, self.path)
         next_row, stream = self._streams.get(names, (-1, iter(())))
         group = int(np.searchsorted(self._starts, row, side="right")) - 1
         with arrow_files(self.path):
