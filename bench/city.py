@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable
 
 from mudg import native
-from mudg.data.city import CityConfig, CityWorld
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
 
 
 def milliseconds(action: Callable[[], object], repeats: int) -> float:

@@ -17,9 +17,10 @@ from scipy.interpolate import griddata
 from mudg import native
 from mudg.base import geometry
 from mudg.base.types import View
-from mudg.core.complete import beyond_reach, complete_depth, visible_depth
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
+from mudg.core.depth import beyond_reach, complete_depth, visible_depth
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
-from mudg.data.city import CityConfig, CityWorld
 
 FAR_M = 100.0
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from mudg.models.depth import depthlab
+from mudg.labels.depth import depthlab
 
 UNET = {
     "_class_name": "UNet2DConditionModel", "in_channels": 8, "out_channels": 4, "block_out_channels": [320, 640, 1280, 1280],

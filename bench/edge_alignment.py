@@ -16,8 +16,9 @@ import numpy as np
 from mudg.base import log
 from mudg.base.geometry import from_rotation_translation
 from mudg.base.types import Frame, Scene, View
-from mudg.data.city import CityConfig, write_city
-from mudg.data.scene.alignment import camera_alignment
+from mudg.city.config import CityConfig
+from mudg.city.logs import write_city
+from mudg.scene.check import camera_alignment
 
 TURNS_DEG = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 """About the camera's y axis, about its x axis."""

@@ -4,7 +4,7 @@
     python bench/fit.py --steps 60 --threads 1        # a quick look: the first 60 of them
     python bench/fit.py --densify mcmc --json fit.json
 
-The scene is a generated city, made once and kept in --work. The loop is `stages/fit.py` as it is: its functions are wrapped with
+The scene is a generated city, made once and kept in --work. The loop is `gaussians/fit.py` as it is: its functions are wrapped with
 a clock, nothing is left out. With one thread processor time is measured, else wall time. "rasteriser" is what the library's own
 clock counts in its phases; "losses" contains torch's backward pass outside the rasteriser, "Adam" the check of gradients before it.
 """
@@ -25,14 +25,15 @@ import torch
 
 from mudg import native
 from mudg.base import log
+from mudg.city.config import CityConfig
 from mudg.core.raster import cpu as raster_cpu
-from mudg.data.city.config import CityConfig
-from mudg.models.scene.densify import DensifyStats
-from mudg.stages import fit
-from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
-from mudg.stages.config.fit import DensifyConfig
-from mudg.stages.fitting.finite import FiniteCheck
-from mudg.stages.fitting.views import StoredView, ViewSet
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians import fit
+from mudg.gaussians.densify import DensifyStats
+from mudg.gaussians.schedule import FiniteCheck
+from mudg.gaussians.settings import DensifyConfig, FitConfig
+from mudg.gaussians.views import StoredView, ViewSet
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
@@ -83,7 +84,7 @@ class Clock:
 
 
 def instrument(clock: Clock) -> None:
-    """Put the clock into the loop of `stages/fit.py`."""
+    """Put the clock into the loop of `gaussians/fit.py`."""
     for part, names in {
         "compose": ("compose",), "Adam": ("adam_step",), "densify": ("_densify_if_due", "shorten_needles"),
         "losses": ("recorded_terms", "virtual_terms", "regularisers"),

@@ -31,16 +31,18 @@ from mudg import native
 from mudg.base import log
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Scene
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
 from mudg.core import trajectory
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationSet, ObservationWriter, read_observations
-from mudg.data.scene import read_scene
-from mudg.stages import fit
-from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
-from mudg.stages.config.fit import VirtualConfig
-from mudg.stages.fitting import kept, views
-from mudg.stages.fitting.views import StoredView, ViewSet
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians import fit, views
+from mudg.gaussians import views as kept
+from mudg.gaussians.settings import FitConfig, VirtualConfig
+from mudg.gaussians.views import StoredView, ViewSet
+from mudg.scene.clouds import read_fused
+from mudg.scene.observations import ObservationSet, ObservationWriter, read_observations
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 

@@ -17,8 +17,8 @@ import time
 from pathlib import Path
 
 from mudg.base import log
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions, parse_frame_range, parse_resolution
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution
 
 
 def main() -> None:

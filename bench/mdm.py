@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Condition, View
-from mudg.models.diffusion import SampleRequest
-from mudg.models.mdm import files as mdm_files
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.requests import SampleRequest
 
 
 def seconds(work: Callable[[], object], repeats: int = 3) -> float:

@@ -28,9 +28,9 @@ import torch
 
 from mudg.base.types import Scene
 from mudg.core.table import Table
-from mudg.models.scene.model import SceneModel
-from mudg.stages.config.view import PageConfig
-from mudg.stages.viewing import view
+from mudg.gaussians.model import SceneModel
+from mudg.viewer import view
+from mudg.viewer.settings import PageConfig
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 JITTER_M = 0.05

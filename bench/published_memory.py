@@ -7,8 +7,8 @@ Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/stage
 
 import sys
 
-from mudg.models.published.model import PublishedConfig
-from mudg.stages.learning import memory_plan
+from mudg.diffusion.published.model import PublishedConfig
+from mudg.diffusion.training import memory_plan
 
 CUTS = (("all at once", 6), ("modalities together, guidance apart", 3), ("guidance together, modalities apart", 2), ("one by one", 1))
 BUDGETS_GB = (8, 10, 16, 24, 40, 80)

@@ -78,7 +78,7 @@ def pose_row(pose: np.ndarray) -> dict[str, list[float]]:
 
 def make_nuscenes(root: Path, seconds: float, rows: int) -> int:
     """Six cameras of 1600x900 at 12 Hz, 34,720 points at 20 Hz; returns the moments of the reference camera."""
-    from mudg.data.importers.nuscenes.sensors import CAMERAS
+    from mudg.formats.importers.nuscenes import CAMERAS
 
     (root / "image.jpg").write_bytes(jpeg(1600, 900))
     xyz = street(34_720)
@@ -135,7 +135,7 @@ def make_argoverse2(root: Path, seconds: float) -> int:
     import pyarrow
     from pyarrow import feather
 
-    from mudg.data.importers.argoverse2 import RING_CAMERAS
+    from mudg.formats.importers.argoverse2 import RING_CAMERAS
 
     def table(path: Path, columns: dict) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -216,8 +216,8 @@ def peak_mb() -> float:
 def measure(name: str, source: Path, out: Path, workers: int) -> None:
     """Import, and print one JSON line; run in a process of its own."""
     from mudg.base import log
-    from mudg.data.importers import IMPORTERS
-    from mudg.data.importers.options import ImportOptions
+    from mudg.formats.importers import IMPORTERS
+    from mudg.formats.importers.common import ImportOptions
 
     log.set_quiet(True)
     before_mb = peak_mb()

@@ -29,8 +29,13 @@ from mudg.base.weather_settings import (
     SnowSettings,
     WeatherSettings,
 )
+from mudg.city.config import CityConfig
+from mudg.city.light import CityLight, city_light
+from mudg.city.world import CityTruth, CityWorld
 from mudg.core import weather
-from mudg.core.weather import fog, ground, relight
+from mudg.core.weather import air as fog
+from mudg.core.weather import ground
+from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
     BufferRules,
     GBuffer,
@@ -42,10 +47,7 @@ from mudg.core.weather.gbuffer import (
     sun_visibility,
     world_points,
 )
-from mudg.core.weather.tone import SRGB, ToneCurve
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.city.weather import CityLight, city_light
-from mudg.data.city.world import CityTruth
+from mudg.core.weather.light import SRGB, ToneCurve
 
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.float32]
@@ -252,8 +254,8 @@ def score_snow(case: Case, cover: float = 0.7) -> Result:
 
 def fitted_view(run: Path, size: tuple[int, int]) -> tuple[Case, tuple[Picture, NDArray[np.float32]]]:
     """The city of a run and what its fitted scene shows of a recorded view."""
-    from mudg.data.scene import read_scene
-    from mudg.fitted import FittedScene
+    from mudg.scene.read import read_scene
+    from mudg.steps.fitted import FittedScene
 
     scene = read_scene(run / "scene")
     world = CityWorld.from_source(scene.source)

@@ -31,7 +31,8 @@ from write_pandaset import write_pandaset
 
 from mudg.base import log
 from mudg.base.types import Scene, Track
-from mudg.data.city import rig, write_city
+from mudg.city import sensors as rig
+from mudg.city.logs import write_city
 
 DISTORTION = (-0.356, 0.171, -0.0003, -0.0002, -0.05)
 PANDASET = {"front_camera": "front", "front_left_camera": "front_left", "front_right_camera": "front",

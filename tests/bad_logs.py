@@ -34,10 +34,10 @@ from PIL import Image
 
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
-from mudg.data.city import rig
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_scene
+from mudg.city import sensors as rig
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene.read import read_scene
 
 Change = Callable[[bytes], bytes]
 TWO = {"cameras": ("front", "front_left")}

@@ -12,8 +12,8 @@ from pathlib import PurePath
 
 import numpy as np
 
-from mudg.data.importers.waymo.tfrecord import masked_crc32c
-from mudg.data.splats import binary
+from mudg.formats.importers.waymo.tfrecord import masked_crc32c
+from mudg.formats.splats import binary
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 HEAD = 400

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mudg.base import config as configuration
-from mudg.stages.config import FitConfig
+from mudg.gaussians.settings import FitConfig
 
 
 def fit_config(**changes: Any) -> FitConfig:

@@ -1,6 +1,6 @@
 """Files of Gaussians as other programs write them, put together byte by byte from the formats' descriptions.
 
-They share no code with ``mudg.data.splats``. `ROWS` are the Gaussians that all of them hold, before a format rounds them.
+They share no code with ``mudg.formats.splats``. `ROWS` are the Gaussians that all of them hold, before a format rounds them.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ import signal
 import sys
 
 from mudg import app
-from mudg.stages import learn
+from mudg.diffusion import learn
 
 what, step_of_fault, rank_of_fault = (os.environ.get("FAULT") or "none:-1:-1").split(":")
 draw = learn.draw_clips

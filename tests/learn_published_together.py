@@ -12,7 +12,7 @@ import torch.distributed as dist
 from toy_published import published_settings
 
 from mudg.base.processes import Interruption
-from mudg.stages import learn
+from mudg.diffusion import learn
 from mudg.steps.learn import Learn
 
 rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])

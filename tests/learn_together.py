@@ -13,7 +13,7 @@ from toy_clips import tiny
 
 from mudg.base.errors import NumericsError, UsageError
 from mudg.base.processes import Interruption
-from mudg.stages import learn
+from mudg.diffusion import learn
 from mudg.steps.learn import Learn
 
 rank, store, clips, out = int(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])

@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from mudg.stages.learning.parallel import Ranks, Spread, gathered, join_processes
-from mudg.stages.learning.state import TrainingState
+from mudg.diffusion.training.parallel import Ranks, Spread, gathered, join_processes
+from mudg.diffusion.training.state import TrainingState
 
 
 class ToyBlocks(nn.Module):

@@ -27,8 +27,9 @@ from mudg import native
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Frame, Scene, Sweep, Track
-from mudg.data.city import CityConfig, write_city
-from mudg.data.scene import read_image, read_points
+from mudg.city.config import CityConfig
+from mudg.city.logs import write_city
+from mudg.scene.read import read_image, read_points
 
 SMALL = CityConfig(
     seed=3, n_frames=5, width=96, height=64, cameras=("front", "front_left"), lidar_beams=16,

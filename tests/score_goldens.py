@@ -15,7 +15,7 @@ import toy_vit
 from test_i3d import made_up
 
 from mudg.base import store
-from mudg.models import clip_image, dinov2, i3d, inception
+from mudg.networks import clip_image, dinov2, i3d, inception
 
 PATH = Path(__file__).parent / "golden" / "score_networks.safetensors"
 KEPT = 48

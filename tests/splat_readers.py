@@ -1,6 +1,6 @@
 """Readers of Gaussian files, written for tests from the formats' descriptions: one Gaussian at a time, with struct and plain numbers.
 
-They share no code with ``mudg.data.splats``. Each returns a list of ``Splat`` in the axes of the file.
+They share no code with ``mudg.formats.splats``. Each returns a list of ``Splat`` in the axes of the file.
 """
 
 from __future__ import annotations

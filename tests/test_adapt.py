@@ -13,17 +13,20 @@ from pretend_device import pretend_device
 
 from mudg.base import palette, store
 from mudg.base.errors import InputError, UsageError
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.clips import shards
-from mudg.data.clips.from_city import HELD_OUT
-from mudg.data.scene import read_image, read_scene
-from mudg.models.mdm import files
-from mudg.models.mdm.extended import extended
-from mudg.stages import adapt, ingest
-from mudg.stages.adapting import clips as adapt_clips
-from mudg.stages.adapting import lessons as adapt_lessons
-from mudg.stages.config import AdaptConfig, FuseConfig, IngestConfig
-from mudg.stages.fitting.storage import load_model
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
+from mudg.diffusion import adapt, files
+from mudg.diffusion import adapt as adapt_clips
+from mudg.diffusion import adapt as adapt_lessons
+from mudg.diffusion.clips import shards
+from mudg.diffusion.clips.from_city import HELD_OUT
+from mudg.diffusion.extended import extended
+from mudg.diffusion.settings.adapt import AdaptConfig
+from mudg.formats import ingest
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians.storage import load_model
+from mudg.scene.read import read_image, read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.adapt import Adapt
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mudg.base.errors import InputError
-from mudg.core.align import align_depth, fit_depth
+from mudg.core.depth import align_depth, fit_depth
 
 
 def some(seed=0):

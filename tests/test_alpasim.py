@@ -19,11 +19,11 @@ from toy_fitted import toy_fitted
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, View
-from mudg.core.ground import HeightMap
-from mudg.data.splats import alpasim
-from mudg.data.splats.cloud import SplatScene
-from mudg.stages.config import ExportConfig
-from mudg.stages.fitting.storage import save_model
+from mudg.core.edit import HeightMap
+from mudg.exporting.settings import ExportConfig
+from mudg.formats.splats import alpasim
+from mudg.formats.splats.cloud import SplatScene
+from mudg.gaussians.storage import save_model
 from mudg.steps.export import Export
 
 TIMES = np.array([0.0, 0.2, 0.4])

@@ -16,17 +16,19 @@ from mudg.base.geometry import yaw_matrix
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.run_folder import RunDir
 from mudg.base.types import EgoPath, Ref, Source, Sweep, View
-from mudg.core.complete import ray_elevation
-from mudg.data.scene import SceneWriter, check_scene, read_image, read_label, read_points, read_scene
-from mudg.models.depth.inputs import Prediction
-from mudg.models.labels.by_geometry import find_sky, label_by_geometry
-from mudg.models.labels.inputs import TRAIN_ID_OF, LabelInput, box_outline
-from mudg.models.labels.labellers import LABELLERS, labeller
-from mudg.stages import annotate
-from mudg.stages.config import AnnotateConfig
-from mudg.stages.labelling import depth as annotate_depth
-from mudg.stages.labelling.ego import steady_bottom
-from mudg.stages.labelling.points import nearest_sweeps
+from mudg.core.depth import ray_elevation
+from mudg.labels import annotate
+from mudg.labels import annotate as annotate_depth
+from mudg.labels.annotate import nearest_sweeps, steady_bottom
+from mudg.labels.by_geometry import find_sky, label_by_geometry
+from mudg.labels.depth.inputs import Prediction
+from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, box_outline
+from mudg.labels.labellers import LABELLERS, labeller
+from mudg.labels.settings import AnnotateConfig
+from mudg.scene.check import check_scene
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.write import SceneWriter
 from mudg.steps.annotate import Annotate
 
 STREET = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0))

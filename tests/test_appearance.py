@@ -17,14 +17,14 @@ from mudg.base.run_folder import RunDir
 from mudg.core.native_ops import adam_columns
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table, torch_adam_columns
-from mudg.data.scene import read_scene
-from mudg.models.scene.appearance import Appearance, owner, rigid_motion
-from mudg.models.scene.model import SceneModel, compose
-from mudg.models.scene.nodes import StaticNode
-from mudg.stages import fit
-from mudg.stages.config import FitConfig
-from mudg.stages.fitting.finite import FiniteCheck
-from mudg.stages.fitting.objects import boxes_in_view, objects_only
+from mudg.gaussians import fit
+from mudg.gaussians.appearance import Appearance, owner, rigid_motion
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.nodes import StaticNode
+from mudg.gaussians.rendering import boxes_in_view, objects_only
+from mudg.gaussians.schedule import FiniteCheck
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.read import read_scene
 
 SIZE = (60, 40)
 RECORDED = ("front/000000", "front/000001", "left/000000")

@@ -19,10 +19,10 @@ from roundtrip import needs_native
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Scene, Track
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.argoverse2 import read_sweep
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers.argoverse2 import read_sweep
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene.read import read_points
 
 pytest.importorskip("pyarrow")
 Columns = dict[str, Any]

@@ -25,10 +25,10 @@ from test_hostile_files import ends_within
 
 from mudg.base.errors import MudgError
 from mudg.base.types import Scene
-from mudg.data.importers.clouds import read_cloud
-from mudg.data.scene import read_points
-from mudg.data.splats import formats
-from mudg.data.splats.cloud import SplatCloud
+from mudg.formats.importers.clouds import read_cloud
+from mudg.formats.splats import formats
+from mudg.formats.splats.cloud import SplatCloud
+from mudg.scene.read import read_points
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("resource") is None, reason="the system limits no memory")
 many_damages = pytest.mark.parametrize("damages", [30, pytest.param(150, marks=pytest.mark.slow)])

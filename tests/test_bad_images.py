@@ -13,7 +13,7 @@ from PIL import Image
 from roundtrip import needs_native
 
 from mudg.base.errors import InputError
-from mudg.data.scene.read import check_image, decode_image
+from mudg.scene.read import check_image, decode_image
 
 pytestmark = needs_native
 

@@ -17,15 +17,20 @@ from toy_scene import ToyStreet
 
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
-from mudg.data.cloudfile import read_fused
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import check_scene, decode_image, read_image, read_points, read_scene, write_zip
-from mudg.stages.config import AnnotateConfig, FuseConfig, IngestConfig, RunConfig
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.settings import IngestConfig
+from mudg.labels.settings import AnnotateConfig
+from mudg.scene.check import check_scene
+from mudg.scene.clouds import read_fused
+from mudg.scene.read import decode_image, read_image, read_points, read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.scene.write import write_zip
 from mudg.steps.annotate import Annotate
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 from mudg.steps.run import Run
+from mudg.steps.settings.run import RunConfig
 
 IMAGE = "image_02/data/0000000003.png"
 SCAN = "velodyne_points/data/0000000003.bin"

@@ -24,7 +24,7 @@ import write_waymo
 from bad_logs import NEEDS_PYARROW, Change
 from roundtrip import needs_native
 
-from mudg.data.importers.options import ImportOptions
+from mudg.formats.importers.common import ImportOptions
 
 pytestmark = needs_native
 

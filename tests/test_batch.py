@@ -12,10 +12,10 @@ from toy_scene import ToyStreet
 
 from mudg import app
 from mudg.base.errors import InputError, UsageError
-from mudg.data.scene import read_scene
-from mudg.stages.batches import plan as lists
-from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.plan import BatchPlan, BatchStage
+from mudg.fleet import plan as lists
+from mudg.fleet.listed import ListedRun, run_listed
+from mudg.fleet.plan import BatchPlan, BatchStage
+from mudg.scene.read import read_scene
 
 STEP = """
 import os, signal, sys

@@ -13,9 +13,8 @@ import pytest
 from test_batches import Scenes
 
 from mudg.base.errors import MudgError
-from mudg.stages import batch
-from mudg.stages.batches import status
-from mudg.stages.batches.work import facts_of, peak_of
+from mudg.fleet import batch, status
+from mudg.fleet.work import facts_of, peak_of
 
 
 @pytest.fixture(scope="module")

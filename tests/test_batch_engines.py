@@ -21,9 +21,9 @@ import slurm_here
 
 from mudg import app
 from mudg.base.location import Location
-from mudg.stages.batches import status
-from mudg.stages.batches.plan import Entry, plan_of
-from mudg.stages.batches.records import BatchFolder, Ended
+from mudg.fleet import status
+from mudg.fleet.plan import Entry, plan_of
+from mudg.fleet.records import BatchFolder, Ended
 
 pytestmark = [pytest.mark.cluster, pytest.mark.slow]
 SCENES = 200

@@ -15,11 +15,11 @@ from test_batches import Scenes, wait_for
 
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.location import Location
-from mudg.stages.batches import status, work
-from mudg.stages.batches.child import Ending, Stop
-from mudg.stages.batches.inputs import FOLDER, InputStore
-from mudg.stages.batches.plan import BatchPlan, BatchStage, Entry
-from mudg.stages.batches.records import BatchFolder, Ended
+from mudg.fleet import status, work
+from mudg.fleet.child import Ending, Stop
+from mudg.fleet.inputs import FOLDER, InputStore
+from mudg.fleet.plan import BatchPlan, BatchStage, Entry
+from mudg.fleet.records import BatchFolder, Ended
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 

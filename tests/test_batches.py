@@ -19,15 +19,15 @@ import pytest
 from mudg import app
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
-from mudg.stages import batch
-from mudg.stages.batches import engines, status, work
-from mudg.stages.batches.child import Stop, last_words, run_step
-from mudg.stages.batches.engines import LocalRun
-from mudg.stages.batches.plan import BatchPlan, BatchStage, Entry, command_of, parse_shard, plan_of, read_list, shard_of
-from mudg.stages.batches.records import BatchFolder, Ended, this_host
-from mudg.stages.batches.work import Job, facts_of
-from mudg.stages.config import BatchConfig, RunConfig
-from mudg.steps.batch import stage_lines
+from mudg.fleet import batch, engines, status, work
+from mudg.fleet.child import Stop, last_words, run_step
+from mudg.fleet.engines import LocalRun
+from mudg.fleet.plan import BatchPlan, BatchStage, Entry, command_of, parse_shard, plan_of, read_list, shard_of
+from mudg.fleet.records import BatchFolder, Ended, this_host
+from mudg.fleet.settings import BatchConfig
+from mudg.fleet.verbs import stage_lines
+from mudg.fleet.work import Job, facts_of
+from mudg.steps.settings.run import RunConfig
 
 STEP = """
 # step.sh NAME OUT TALLY: a line per run; then what is in TALLY/NAME.do, or a small result
@@ -320,7 +320,7 @@ import sys, time
 from pathlib import Path
 from mudg.base.errors import UsageError
 from mudg.base.location import Location
-from mudg.stages.batches.records import BatchFolder
+from mudg.fleet.records import BatchFolder
 start, out = Path(sys.argv[1]), Path(sys.argv[2])
 (out.parent / ("ready" + sys.argv[3])).touch()
 while not start.exists():

@@ -10,12 +10,12 @@ import torch
 
 from mudg.base.errors import MudgError, UsageError
 from mudg.benchmarks import run as bench
-from mudg.core import flicker
-from mudg.data.clips import from_city
-from mudg.models.mdm import files
-from mudg.models.mdm.codec import CodecConfig
-from mudg.models.mdm.model import MDM, MDMConfig
-from mudg.stages.config import BenchConfig
+from mudg.benchmarks.settings import BenchConfig
+from mudg.core import metrics as flicker
+from mudg.diffusion import files
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.networks.codec import CodecConfig
 
 SMALL = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,

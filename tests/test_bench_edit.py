@@ -11,8 +11,8 @@ import pytest
 
 from mudg.benchmarks import edit
 from mudg.benchmarks import run as bench
-from mudg.models.scene.edited import display_of
-from mudg.stages.config import BenchConfig
+from mudg.benchmarks.settings import BenchConfig
+from mudg.editing.model import display_of
 
 
 def seen(vehicle: float, truth: float) -> edit.Seen:

@@ -16,14 +16,17 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.benchmarks import edit_runs
 from mudg.benchmarks import run as bench
-from mudg.benchmarks.edit_runs_measure import RunCase, measured
-from mudg.core import edit_scores
+from mudg.benchmarks.edit_runs import RunCase, measured
+from mudg.benchmarks.settings import BenchConfig
+from mudg.core import view_metrics as edit_scores
 from mudg.core.table import Table
-from mudg.data.cloudfile import write_fused
-from mudg.data.edits import parse_edits
-from mudg.stages.config import AnnotateConfig, BenchConfig, FuseConfig, IngestConfig
-from mudg.stages.editing.runs import find_run
-from mudg.stages.fitting.storage import load_model
+from mudg.editing.runs import find_run
+from mudg.editing.script import parse_edits
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians.storage import load_model
+from mudg.labels.settings import AnnotateConfig
+from mudg.scene.clouds import write_fused
+from mudg.scene.settings import FuseConfig
 from mudg.steps.annotate import Annotate
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse

@@ -20,16 +20,21 @@ from mudg.benchmarks import run as bench
 from mudg.benchmarks.chain import FillViews
 from mudg.benchmarks.papers import PAPERS, RECORDED, SCENE_LISTS, TABLES
 from mudg.benchmarks.rows import LONGER, paper_rows
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city import logs as city_logs
+from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.core.feature_distances import frechet_distance, kernel_distance
-from mudg.data.city import logs as city_logs
-from mudg.data.city.config import CityConfig
-from mudg.data.scene import read_scene
-from mudg.methods import METHODS
-from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM
-from mudg.stages import ingest
-from mudg.stages.config import BenchConfig, FitConfig, FuseConfig, IngestConfig, ScoreConfig, SynthesizeConfig
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.model import MDM
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.editing.view_settings import ScoreConfig
+from mudg.formats import ingest
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians.methods import METHODS
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 

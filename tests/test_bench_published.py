@@ -18,27 +18,24 @@ from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
 from mudg.benchmarks.papers import RECORDED, TABLES
 from mudg.benchmarks.rows import LONGER, method_fit, shift_rows
-from mudg.data.city.config import CityConfig
-from mudg.data.city.logs import LogRules
-from mudg.data.clips.ablated import ConditionSources, conditions_of
-from mudg.data.clips.condition import ConditionRules
-from mudg.data.cloudfile import read_fused
-from mudg.data.scene import read_image, read_scene
-from mudg.models.published import files as published_files
-from mudg.models.published.video_unet import VideoUNet
-from mudg.stages import ingest
-from mudg.stages.config import (
-    BenchConfig,
-    FitConfig,
-    FuseConfig,
-    IngestConfig,
-    SynthesizeConfig,
-    bench_preset,
-    run_preset,
-)
-from mudg.stages.learning.views import recorded_images
+from mudg.benchmarks.settings import BenchConfig, bench_preset
+from mudg.city.config import CityConfig
+from mudg.city.logs import LogRules
+from mudg.diffusion.clips.condition import ConditionRules
+from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
+from mudg.diffusion.published import model as published_files
+from mudg.diffusion.published.video_unet import VideoUNet
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.views import recorded_images
+from mudg.formats import ingest
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.clouds import read_fused
+from mudg.scene.read import read_image, read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
+from mudg.steps.settings.presets import run_preset
 
 MODALITIES = 3
 

@@ -19,25 +19,27 @@ from mudg.benchmarks import columns, places, real, truth
 from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
-from mudg.core import color_match, points_seen
+from mudg.benchmarks.settings import BenchConfig  # fmt: skip
+from mudg.city.world import CityWorld
+from mudg.core import calibration as color_match
+from mudg.core import lidar as points_seen
 from mudg.core.fusion import STATIC
-from mudg.data.city import CityWorld
-from mudg.data.importers.pandaset.pandas_frame import read_frame
-from mudg.data.observations import ObservationWriter
-from mudg.data.scene import SceneWriter, read_image, read_label, read_points, read_scene
-from mudg.data.scene.part import write_part
-from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM
-from mudg.stages import ingest, render
-from mudg.stages.config import (
-    AdaptConfig,
-    BenchConfig,
-    FitConfig,
-    FuseConfig,
-    IngestConfig,
-    RenderConfig,
-    SynthesizeConfig,
-)  # fmt: skip
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.model import MDM
+from mudg.diffusion.settings.adapt import AdaptConfig  # fmt: skip
+from mudg.diffusion.settings.synthesize import SynthesizeConfig  # fmt: skip
+from mudg.editing import render
+from mudg.editing.view_settings import RenderConfig  # fmt: skip
+from mudg.formats import ingest
+from mudg.formats.importers.pandaset import read_frame
+from mudg.formats.settings import IngestConfig  # fmt: skip
+from mudg.gaussians.settings import FitConfig  # fmt: skip
+from mudg.scene.labels import read_label
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.part import write_part
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.settings import FuseConfig  # fmt: skip
+from mudg.scene.write import SceneWriter
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 
@@ -47,7 +49,7 @@ BY_NAME = {protocol.name: protocol for protocol in PROTOCOLS}
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    from mudg.data.city.config import CityConfig
+    from mudg.city.config import CityConfig
 
     out = tmp_path_factory.mktemp("log") / "city"
     return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY))).run()

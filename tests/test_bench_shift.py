@@ -15,16 +15,16 @@ from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
 from mudg.benchmarks.chain import ExactViews
 from mudg.benchmarks.rows import LONGER, shift_rows
-from mudg.data.city import CityWorld
-from mudg.data.city import logs as city_logs
-from mudg.data.city.logs import LogRules
-from mudg.data.clips import from_city
-from mudg.data.observations import list_observation_sets, read_observations
-from mudg.methods import METHODS, PUBLISHED
-from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM
-from mudg.stages import score_truth
-from mudg.stages.config import BenchConfig
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city import logs as city_logs
+from mudg.city.logs import LogRules
+from mudg.city.world import CityWorld
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.model import MDM
+from mudg.gaussians.methods import METHODS, PUBLISHED
+from mudg.scene.observations import list_observation_sets, read_observations
+from mudg.scoring import truth as score_truth
 
 TINY = LogRules(frames=4, width=96, height=64, cameras=("front",))
 

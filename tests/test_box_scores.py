@@ -8,7 +8,7 @@ import pytest
 from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
-from mudg.core import box_scores
+from mudg.core import street_scores as box_scores
 
 CAMERA = Camera("front", 480, 320, 240.0, 240.0, 240.0, 160.0)
 VIEW = View(CAMERA, np.eye(4), 0.0)

@@ -15,14 +15,17 @@ from mudg.base import store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
 from mudg.base.errors import InputError
 from mudg.base.types import Photo
-from mudg.core.color_match import match_cameras
+from mudg.core.calibration import match_cameras
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.clips.condition import ConditionRules, build_conditions
-from mudg.data.cloudfile import read_fused
-from mudg.data.scene import SceneWriter, read_image, read_label, read_scene
-from mudg.stages import fit
-from mudg.stages.config import FuseConfig, IngestConfig
-from mudg.stages.fitting.rendering import render_view
+from mudg.diffusion.clips.condition import ConditionRules, build_conditions
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians import fit
+from mudg.gaussians.rendering import render_view
+from mudg.scene.clouds import read_fused
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.scene.write import SceneWriter
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest

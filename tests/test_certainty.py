@@ -16,21 +16,14 @@ from mudg.base import store
 from mudg.base.types import Gaussians, Track
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
-from mudg.data.cloudfile import write_fused
-from mudg.models.scene.model import SceneModel, compose
-from mudg.models.scene.nodes import RigidNode, StaticNode
-from mudg.models.scene.sky import SkyNode
-from mudg.stages import fit
-from mudg.stages.fitting.certainty import (
-    COLOR_ERROR,
-    DEPTH_ERROR,
-    PhotoEvidence,
-    certainty_of,
-    difference_images,
-    weight_sums,
-)
-from mudg.stages.fitting.rendering import render_condition
-from mudg.stages.fitting.views import LidarPixels, StoredView
+from mudg.gaussians import fit
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.nodes import RigidNode, StaticNode
+from mudg.gaussians.rendering import render_condition
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.trust import COLOR_ERROR, DEPTH_ERROR, PhotoEvidence, certainty_of, difference_images, weight_sums
+from mudg.gaussians.views import LidarPixels, StoredView
+from mudg.scene.clouds import write_fused
 from mudg.steps.fit import Fit
 
 RASTER = RasterConfig(near_m=0.2)

@@ -14,8 +14,9 @@ from mudg import native
 from mudg.base import geometry, palette
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, Source, View
-from mudg.data.city import CityConfig, CitySweep, CityWorld
-from mudg.data.city import records as rec
+from mudg.city import objects as rec
+from mudg.city.config import CityConfig
+from mudg.city.world import CitySweep, CityWorld
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 
@@ -428,7 +429,7 @@ def test_same_result_with_any_number_of_threads(world: CityWorld) -> None:
 
 def test_same_result_in_another_process(world: CityWorld) -> None:
     code = (
-        "import hashlib\nfrom mudg.data.city import CityConfig, CityWorld\n"
+        "import hashlib\nfrom mudg.city import CityConfig, CityWorld\n"
         f"w = CityWorld(CityConfig(**{ {k: getattr(CONFIG, k) for k in CONFIG.__dataclass_fields__}!r}))\n"
         "print(hashlib.sha256(w.render(w.frame_views('front')[1]).rgb.tobytes()).hexdigest())"
     )
@@ -505,7 +506,7 @@ def test_sources_without_a_recipe_are_refused(world: CityWorld) -> None:
 
 
 def test_without_the_library_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg.data.city import native as layer
+    from mudg.city import native as layer
 
     layer.library.cache_clear()
     monkeypatch.setattr(native, "library", lambda: None)
@@ -524,11 +525,11 @@ def test_no_traffic_and_one_camera_work() -> None:
 
 
 def test_records_agree_with_the_library() -> None:
-    from mudg.data.city.native import library
+    from mudg.city.native import library
 
     assert library().mudg_city_number_counts(2) == rec.COLUMNS
 
 
 def test_importing_the_city_loads_no_torch() -> None:
-    code = "import sys, mudg.data.city, mudg.data.city.world; assert 'torch' not in sys.modules"
+    code = "import sys, mudg.city, mudg.city.world; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,15 +11,16 @@ from mudg import native
 from mudg.base.errors import UsageError
 from mudg.base.types import SweepPoints
 from mudg.core import metrics
-from mudg.data.clips import from_city
-from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.from_city import CityClipRules
-from mudg.data.scene import read_image, read_label, read_points, read_scene
-from mudg.data.scene.photos import write_photos
-from mudg.models.mdm import files
-from mudg.stages.learning import city_fits
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import models as learn_models
+from mudg.diffusion import files
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.from_city import CityClipRules
+from mudg.diffusion.training import clips as city_fits
+from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion.training import models as learn_models
+from mudg.scene.labels import read_label
+from mudg.scene.part import write_photos
+from mudg.scene.read import read_image, read_points, read_scene
 from mudg.steps.learn import Learn
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the native library is not built")

@@ -11,8 +11,9 @@ from PIL import Image
 
 from mudg import native
 from mudg.base.errors import InputError
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.city.photos import SKY_SLOT, draw_photos, panorama, radiance, surface
+from mudg.city.config import CityConfig
+from mudg.city.photos import SKY_SLOT, draw_photos, panorama, radiance, surface
+from mudg.city.world import CityWorld
 
 
 def hdr_bytes(rgbe: np.ndarray) -> bytes:

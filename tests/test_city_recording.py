@@ -10,8 +10,11 @@ import pytest
 from mudg import native
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
-from mudg.data.city import CityConfig, CityWorld, write_city
-from mudg.data.scene import read_image, read_label, read_points
+from mudg.city.config import CityConfig
+from mudg.city.logs import write_city
+from mudg.city.world import CityWorld
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 

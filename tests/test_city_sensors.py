@@ -11,16 +11,18 @@ import pytest
 
 from mudg import native
 from mudg.base.types import Camera, SweepPoints, Track
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.city.rig import LidarScan, ego_from_lidar, lidar_elevations
-from mudg.data.city.sensors import (
+from mudg.city.config import CityConfig
+from mudg.city.sensors import (
     BoxFaults,
     CameraFaults,
     CameraLook,
     LidarFaults,
+    LidarScan,
     PoseFaults,
     SensorFaults,
+    ego_from_lidar,
     kept_points,
+    lidar_elevations,
     noisy_tracks,
     pose_errors,
     recorded,
@@ -29,8 +31,9 @@ from mudg.data.city.sensors import (
     to_light,
     with_look,
 )
-from mudg.data.clips import from_city, varied
-from mudg.data.clips.city_log import CityLog, record_with_faults
+from mudg.city.world import CityWorld
+from mudg.diffusion.clips import from_city, varied
+from mudg.diffusion.clips.from_city import CityLog, record_with_faults
 
 needs_native = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
 
@@ -274,7 +277,7 @@ def test_the_distribution_covers_what_it_says() -> None:
 
 
 def _focal(config: CityConfig) -> float:
-    from mudg.data.city.rig import cameras
+    from mudg.city.sensors import cameras
 
     return cameras(config)["front"].fx
 
@@ -351,10 +354,10 @@ def test_varied_clips_are_reproducible() -> None:
 
 def _golden(config: CityConfig) -> str:
     """Digest of what a configuration draws, up to the last digits of a machine's sines."""
-    from mudg.data.city.furnish import furnish
-    from mudg.data.city.layout import plan_streets
-    from mudg.data.city.light import light_numbers
-    from mudg.data.city.traffic import ego_keys, plan_traffic
+    from mudg.city.furnish import furnish
+    from mudg.city.layout import plan_streets
+    from mudg.city.light import light_numbers
+    from mudg.city.traffic import ego_keys, plan_traffic
 
     plan = plan_streets(config)
     ego = ego_keys(config, plan)

@@ -10,10 +10,13 @@ import pytest
 from mudg import native
 from mudg.base.palette import ID
 from mudg.base.types import View
-from mudg.core.weather import fog, ground, relight
+from mudg.city.config import CityConfig
+from mudg.city.light import city_light, weather_numbers
+from mudg.city.world import CityWorld
+from mudg.core.weather import air as fog
+from mudg.core.weather import ground
+from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import euclidean_range, world_points
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.city.weather import city_light, weather_numbers
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 

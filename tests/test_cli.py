@@ -11,7 +11,7 @@ import pytest
 from mudg import app
 from mudg.base import config as configuration
 from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
-from mudg.stages import config as stage_config
+from mudg.steps import settings as stage_config
 from mudg.steps.doctor import Doctor
 
 

@@ -8,13 +8,14 @@ import torch
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
-from mudg.core import visible
+from mudg.core import project as visible
 from mudg.core.fusion import SweepShots
-from mudg.data.clips import condition as clips
-from mudg.data.clips import from_city, near_points
-from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.ablated import ConditionSources, conditions_of
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
+from mudg.diffusion.clips import condition as clips
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.clips import inputs as near_points
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions
+from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
 RULES = ConditionRules(48, 32, occluder_m=0.0)
@@ -264,8 +265,8 @@ def test_variation_treats_truth_and_condition_alike(tmp_path):
 
 def test_city_clips_are_a_function_of_seed_and_number():
     from mudg import native
-    from mudg.data.clips import from_city
-    from mudg.data.clips.from_city import CityClipRules
+    from mudg.diffusion.clips import from_city
+    from mudg.diffusion.clips.from_city import CityClipRules
 
     if native.library() is None:
         pytest.skip("the native library is not built")
@@ -283,7 +284,7 @@ def test_city_clips_are_a_function_of_seed_and_number():
 
 
 def test_held_out_cities_have_the_stated_shifts():
-    from mudg.data.clips.from_city import HELD_OUT, CityClipRules, shifts_of
+    from mudg.diffusion.clips.from_city import HELD_OUT, CityClipRules, shifts_of
 
     rules = CityClipRules()
     assert shifts_of(rules, HELD_OUT) == (2.0, -3.0, 4.0, 0.0)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mudg.base.errors import InputError
-from mudg.data.importers import clouds
+from mudg.formats.importers import clouds
 
 XYZ = np.array([[1.5, -2, 3], [4, 5.25, -6], [0, 0, 0.5]], np.float32)
 LEVEL = np.array([0, 128, 255], np.uint16)

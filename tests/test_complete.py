@@ -8,13 +8,7 @@ from scipy import ndimage, sparse
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
-from mudg.core.complete import (
-    CompletionRules,
-    beyond_reach,
-    complete_depth,
-    conjugate_gradients,
-    ray_elevation,
-)
+from mudg.core.depth import CompletionRules, beyond_reach, complete_depth, conjugate_gradients, ray_elevation
 
 HEIGHT, WIDTH, FOCAL = 60, 90, 80.0
 CAMERA = Camera("c", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

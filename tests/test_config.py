@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from mudg.base import config
 from mudg.base.errors import InputError, UsageError
-from mudg.stages.config import RenderConfig
+from mudg.editing.view_settings import RenderConfig
 
 
 @dataclass(frozen=True, kw_only=True, config=config.STRICT)

@@ -13,8 +13,8 @@ from toy_scene import CAR_SIZE_M, ToyStreet
 from mudg.base.geometry import CAM_FROM_EGO_AXES, box_corners, invert, project, transform_points, yaw_matrix
 from mudg.base.types import Camera, View
 from mudg.core.pictures import depth_colors
-from mudg.pages import contact_sheet as sheets
-from mudg.pages import top_view as above
+from mudg.scene import contact_sheet as above
+from mudg.scene import contact_sheet as sheets
 
 VIEW = View(Camera("front", 96, 64, 70.0, 70.0, 48.0, 32.0), invert(CAM_FROM_EGO_AXES), 0.0)
 

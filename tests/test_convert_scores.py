@@ -15,9 +15,10 @@ from test_score_metrics import lpips_state
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.models import i3d, inception
-from mudg.stages.config import ConvertConfig, ScoreConfig
-from mudg.stages.scoring import converted
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.editing.view_settings import ScoreConfig
+from mudg.networks import i3d, inception
+from mudg.scoring import converted
 from mudg.steps.convert import Convert
 from mudg.steps.score import Score
 

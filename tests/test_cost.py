@@ -14,10 +14,12 @@ from mudg import native
 from mudg.base import store
 from mudg.base.memory import in_words
 from mudg.core.raster import probe
-from mudg.stages import doctor
-from mudg.stages.config import RunConfig, cost, run_preset
-from mudg.stages.fitting import kept
+from mudg.gaussians import views as kept
+from mudg.steps import diagnosis as doctor
 from mudg.steps.run import Demo, Run
+from mudg.steps.settings import cost
+from mudg.steps.settings.presets import run_preset
+from mudg.steps.settings.run import RunConfig
 from mudg.steps.step import texts_of
 
 DEMO = cost.SceneSize(images=72, path_images=24, width=384, height=256, points=100_600)

@@ -18,11 +18,10 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import Scene, SweepPoints
-from mudg.data.importers import IMPORTERS, RECOGNISERS, common
-from mudg.data.importers.custom import importer as custom
-from mudg.data.importers.custom.schema import read_log
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS, common, custom
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.custom import read_log
+from mudg.scene.read import read_points
 
 pytestmark = roundtrip.needs_native
 LIDAR = "lidar"

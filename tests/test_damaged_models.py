@@ -20,16 +20,15 @@ from toy_scene import EGO_FROM_CAM
 from mudg.base import store
 from mudg.base.errors import MudgError
 from mudg.base.types import Camera
+from mudg.baselines.emernerf.field import Budget
+from mudg.baselines.emernerf.fit import load_field, save_field
 from mudg.core.table import Table
-from mudg.fitted import FittedScene
-from mudg.models.labels import street_net
-from mudg.models.mdm import files as mdm_files
-from mudg.models.published import files as published_files
-from mudg.models.radiance.march import Budget
-from mudg.models.scene.appearance import RECORDED_COLOR, Appearance
-from mudg.stages.fitting.continued import StartFit, all_classes
-from mudg.stages.fitting.storage import kind_of, load_appearance, save_appearance, save_model
-from mudg.stages.radiance.storage import load_field, save_field
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.published import model as published_files
+from mudg.gaussians.appearance import RECORDED_COLOR, Appearance
+from mudg.gaussians.storage import StartFit, all_classes, kind_of, load_appearance, save_appearance, save_model
+from mudg.labels import street_net
+from mudg.steps.fitted import FittedScene
 
 CAMERA = Camera("front", 24, 16, 20.0, 20.0, 12.0, 8.0)
 VALUES: list[Any] = [None, "x", -1, 10**30, 1e300, True, [], [1], [[1, "x"]], {}, {"x": 1}]

@@ -21,16 +21,19 @@ from test_report import finished_run
 from mudg.base import checkpoint, store
 from mudg.base.config import result_settings
 from mudg.base.types import FusedCloud, PointCloud
-from mudg.data.cloudfile import read_fused, write_fused
-from mudg.data.observations import read_observations
-from mudg.pages import gallery, run_report
-from mudg.stages import convert, edit, score
-from mudg.stages.config import RunConfig
-from mudg.stages.editing.runs import RunParts
-from mudg.stages.fitting.continued import StartFit
-from mudg.stages.learning.score import plot_losses
-from mudg.stages.scoring.detections import read_detections
+from mudg.diffusion.training.score import plot_losses
+from mudg.editing import edit
+from mudg.editing.runs import RunParts
+from mudg.gaussians.storage import StartFit
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.observations import read_observations
+from mudg.scoring import score
+from mudg.scoring.detections import read_detections
+from mudg.steps import conversion as convert
 from mudg.steps import pipeline
+from mudg.steps.settings.run import RunConfig
+from mudg.viewer import gallery
+from mudg.viewer import report as run_report
 
 CASES = 24
 """Of each record, by seeded chance; there may be thousands."""

@@ -12,7 +12,7 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.types import RasterTrace
 from mudg.core.table import Table
-from mudg.models.scene.densify import (
+from mudg.gaussians.densify import (
     SPLIT_SHRINK,
     DensifySettings,
     DensifyStats,
@@ -21,9 +21,9 @@ from mudg.models.scene.densify import (
     rotate,
     shorten_needles,
 )
-from mudg.models.scene.model import SceneModel
-from mudg.models.scene.nodes import RigidNode, StaticNode
-from mudg.stages.config import FitConfig
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode, StaticNode
+from mudg.gaussians.settings import FitConfig
 
 SETTINGS = DensifySettings(
     start=10, stop=100, every=10, static_gradient=1.0, object_gradient=1.0, split_above_m=0.5, max_rows=1000, growth=10.0

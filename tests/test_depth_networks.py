@@ -13,10 +13,10 @@ from PIL import Image
 from tiny_networks import package
 
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.core.complete import CompletionRules
-from mudg.models.depth.inputs import DepthInput, DepthOptions, Prediction
-from mudg.models.depth.marigold import Marigold
-from mudg.models.depth.networks import (
+from mudg.core.depth import CompletionRules
+from mudg.labels.depth.inputs import DepthInput, DepthOptions, Prediction
+from mudg.labels.depth.marigold import Marigold
+from mudg.labels.depth.networks import (
     KINDS,
     align_to_lidar,
     kind_of,
@@ -24,7 +24,7 @@ from mudg.models.depth.networks import (
     load_depth_network,
     residual_confidence,
 )
-from mudg.models.folders import Place
+from mudg.networks.folders import Place
 
 RULES = CompletionRules()
 real_packages = pytest.mark.filterwarnings("ignore")

@@ -23,14 +23,16 @@ from torch import Tensor
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.data.scene import read_label, read_scene
-from mudg.models.depth import depthlab
-from mudg.models.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
-from mudg.models.depth.inputs import DepthInput, DepthOptions
-from mudg.models.depth.networks import kind_of, load_depth_network
-from mudg.models.folders import Place
-from mudg.stages.config import AnnotateConfig, ConvertConfig
-from mudg.stages.converting import depthlab as conversion
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.labels.depth import depthlab
+from mudg.labels.depth import depthlab as conversion
+from mudg.labels.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
+from mudg.labels.depth.inputs import DepthInput, DepthOptions
+from mudg.labels.depth.networks import kind_of, load_depth_network
+from mudg.labels.settings import AnnotateConfig
+from mudg.networks.folders import Place
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_scene
 from mudg.steps.annotate import Annotate
 from mudg.steps.convert import Convert
 

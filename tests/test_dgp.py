@@ -16,9 +16,9 @@ from roundtrip import needs_native
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, project, transform_points
 from mudg.base.types import Scene
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene.read import read_points
 
 CAMERAS = {"front": "front", "front_left": "front_left"}
 

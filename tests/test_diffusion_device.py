@@ -21,23 +21,29 @@ from toy_scene import ToyStreet
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
-from mudg.core.align import fit_depth
-from mudg.data.observations import read_observations
-from mudg.data.scene import read_label, read_scene
-from mudg.models.depth.inputs import DepthInput
-from mudg.models.depth.networks import Preparation, TransformersDepth
-from mudg.models.diffusion import GeneratedClip, SampleRequest, generated, generated_and_finished
-from mudg.models.folders import Place
-from mudg.models.labels import street_net
-from mudg.models.labels.segmenters import Segmenter
-from mudg.models.mdm import files
-from mudg.models.mdm.model import MDM
-from mudg.models.published import files as published_files
-from mudg.models.published.model import WorkSplit
-from mudg.stages import convert, learn
-from mudg.stages.config import AnnotateConfig, ConvertConfig, FuseConfig, SynthesizeConfig
-from mudg.stages.learning import loading, parallel, precision
-from mudg.stages.learning.models import model_config
+from mudg.core.depth import fit_depth
+from mudg.diffusion import files, learn
+from mudg.diffusion import views as loading
+from mudg.diffusion.model import MDM
+from mudg.diffusion.published import model as published_files
+from mudg.diffusion.published.model import WorkSplit
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.training import memory_plan as precision
+from mudg.diffusion.training import parallel
+from mudg.diffusion.training.models import model_config
+from mudg.labels import street_net
+from mudg.labels.depth.inputs import DepthInput
+from mudg.labels.depth.networks import Preparation, TransformersDepth
+from mudg.labels.segmenters import Segmenter
+from mudg.labels.settings import AnnotateConfig
+from mudg.networks.folders import Place
+from mudg.scene.labels import read_label
+from mudg.scene.observations import read_observations
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.steps import conversion as convert
 from mudg.steps.annotate import Annotate
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn

@@ -10,18 +10,19 @@ import torch
 from toy_world import camera, fused_cloud, view_at
 
 from mudg.base.errors import UsageError
-from mudg.base.renders import RenderPlanes
-from mudg.base.types import FusedCloud, Photo
+from mudg.base.types import FusedCloud, Photo, RenderPlanes
 from mudg.benchmarks import chain
 from mudg.benchmarks.chain import Chain, repair_settings
 from mudg.benchmarks.rows import Row
-from mudg.data.clips import condition as clips
-from mudg.data.clips.ablated import ConditionSources, conditions_of
-from mudg.data.clips.condition import ConditionRules
-from mudg.methods import METHODS
-from mudg.stages.config import BenchConfig, FitConfig, SynthesizeConfig
-from mudg.stages.fitting.recipes import recipe_of
-from mudg.stages.learning import loading
+from mudg.benchmarks.settings import BenchConfig
+from mudg.diffusion import views as loading
+from mudg.diffusion.clips import condition as clips
+from mudg.diffusion.clips.condition import ConditionRules
+from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.gaussians.methods import METHODS
+from mudg.gaussians.recipes import recipe_of
+from mudg.gaussians.settings import FitConfig
 
 
 def shown(view):

@@ -35,7 +35,8 @@ FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--rdzv
                  **dict.fromkeys(("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle",
                                   "--shutdown-timeout"), "torchrun"),
                  **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch")}  # fmt: skip
-FOLDERS = "base core native data models pages stages steps benchmarks bench docs tests tools build_backend src".split()
+FOLDERS = ("benchmarks fleet steps viewer scoring exporting editing diffusion baselines gaussians labels formats city scene networks core native "
+           "base bench docs tests tools build_backend src").split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 
 
@@ -333,7 +334,7 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
     assert unknown_paths("`stages/no_such.py` `no_such.py` `models/no_such/`") == [
         "stages/no_such.py", "no_such.py", "models/no_such/",
     ]  # fmt: skip
-    assert not unknown_paths("`stages/fit.py` `src/mudg/app.py` `models/mdm/`")
+    assert not unknown_paths("`gaussians/fit.py` `src/mudg/app.py` `diffusion/`")
     page = tmp_path / "page.md"
     page.write_text("# One head\n[a](other.md) [b](#one-head) [c](#two)", encoding="utf-8")
     assert broken_links(page) == ["other.md", "#two"]

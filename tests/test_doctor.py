@@ -9,8 +9,8 @@ import pytest
 import toy_views
 
 from mudg import app
-from mudg.data.exporters import video
-from mudg.stages import doctor
+from mudg.formats.exporters import video
+from mudg.steps import diagnosis as doctor
 
 
 def test_machine_report_names_what_matters() -> None:

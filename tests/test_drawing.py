@@ -11,14 +11,15 @@ import torch
 
 from mudg import native
 from mudg.base.errors import UsageError
+from mudg.city.config import CityConfig
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.city import CityConfig
-from mudg.data.scene import read_scene
-from mudg.models.scene.model import compose
-from mudg.stages import fit
-from mudg.stages.config import FitConfig, FuseConfig, IngestConfig
-from mudg.stages.config.fit import AppearanceConfig, DensifyConfig, DrawingConfig, StartConfig
-from mudg.stages.fitting.rendering import NEAR_M, check_drawing, raster_of, rasterize
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians import fit
+from mudg.gaussians.model import compose
+from mudg.gaussians.rendering import NEAR_M, check_drawing, raster_of, rasterize
+from mudg.gaussians.settings import AppearanceConfig, DensifyConfig, DrawingConfig, FitConfig, StartConfig
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest

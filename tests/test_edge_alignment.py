@@ -13,12 +13,13 @@ from toy_scene import ToyStreet
 
 from mudg import native
 from mudg.base.types import Frame, Scene, View
-from mudg.core import edge_alignment as edges
-from mudg.data.city import CityConfig, write_city
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene.alignment import camera_alignment, describe
-from mudg.stages import doctor
+from mudg.city.config import CityConfig
+from mudg.city.logs import write_city
+from mudg.core import calibration as edges
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene.check import camera_alignment, describe
+from mudg.steps import diagnosis as doctor
 
 TURNS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
@@ -109,7 +110,7 @@ def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
 def test_doctor_tells_of_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     doubtful = edges.EdgeAlignment(0.2, (1.0, -0.5), 0.2, 900, "doubtful")
-    from mudg.data.scene import alignment
+    from mudg.scene import check as alignment
 
     for found, level, said in (
         (doubtful, "warning", "+1.0 degrees"),

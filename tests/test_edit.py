@@ -18,31 +18,30 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
+from mudg.baselines.bezier import BezierNode
+from mudg.baselines.omnire import DeformedNode
 from mudg.benchmarks.edit import city_keys
-from mudg.core import boxes
+from mudg.city import objects as rec
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
+from mudg.core import edit as boxes
 from mudg.core import edit as paths
-from mudg.core.edit import Displacement, Motion
-from mudg.core.ground import HeightMap
+from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.city import records as rec
-from mudg.data.edits import parse_edits, read_edits
-from mudg.models.scene import edited
-from mudg.models.scene.bezier import BezierNode
-from mudg.models.scene.deformed import DeformedNode
-from mudg.models.scene.initial import SH_C0
-from mudg.models.scene.model import CERTAINTY, SceneModel, compose
-from mudg.models.scene.nodes import DeformableNode, RigidNode, StaticNode
-from mudg.models.scene.sky import SkyNode
-from mudg.stages.config import DEMO_CITY
-from mudg.stages.editing import assets
-from mudg.stages.editing.apply import edited_cloud, edited_model
-from mudg.stages.editing.carried import carry_out
-from mudg.stages.editing.checks import collisions
-from mudg.stages.editing.light import surface_light, take_light
-from mudg.stages.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
-from mudg.stages.fitting.rendering import render_view
+from mudg.editing import assets
+from mudg.editing import model as edited
+from mudg.editing.apply import edited_cloud, edited_model
+from mudg.editing.carried import carry_out
+from mudg.editing.light import surface_light, take_light
+from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, collisions, plan_edits
+from mudg.editing.script import parse_edits, read_edits
+from mudg.gaussians.model import CERTAINTY, SceneModel, compose
+from mudg.gaussians.nodes import DeformableNode, RigidNode, StaticNode
+from mudg.gaussians.rendering import render_view
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.start import SH_C0
+from mudg.steps.settings.presets import DEMO_CITY
 
 SIZE = (4.0, 2.0, 1.5)
 

@@ -10,8 +10,12 @@ import pytest
 from fit_settings import fit_config
 
 from mudg.base import geometry, store
-from mudg.data.scene import check_scene, read_image, read_points, read_scene
-from mudg.stages.config import AnnotateConfig, EditConfig, FuseConfig, IngestConfig
+from mudg.editing.settings import EditConfig
+from mudg.formats.settings import IngestConfig
+from mudg.labels.settings import AnnotateConfig
+from mudg.scene.check import check_scene
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.annotate import Annotate
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit

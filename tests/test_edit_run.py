@@ -19,15 +19,20 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Scene
 from mudg.benchmarks import run as bench
-from mudg.data.cloudfile import read_fused, write_fused
-from mudg.data.edits import parse_edits
-from mudg.data.observations import read_observations
-from mudg.data.scene import check_scene, read_image, read_label, read_points, read_scene
-from mudg.stages import edit
-from mudg.stages.config import BenchConfig, EditConfig, FuseConfig, RenderConfig
-from mudg.stages.editing.apply import left_behind
-from mudg.stages.editing.carried import EditedDrive, carry_out
-from mudg.stages.fitting.storage import load_model
+from mudg.benchmarks.settings import BenchConfig
+from mudg.editing import edit
+from mudg.editing.apply import left_behind
+from mudg.editing.carried import EditedDrive, carry_out
+from mudg.editing.script import parse_edits
+from mudg.editing.settings import EditConfig
+from mudg.editing.view_settings import RenderConfig
+from mudg.gaussians.storage import load_model
+from mudg.scene.check import check_scene
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.labels import read_label
+from mudg.scene.observations import read_observations
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse

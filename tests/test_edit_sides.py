@@ -13,14 +13,13 @@ from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.edits import parse_edits
-from mudg.models.scene.initial import SH_C0
-from mudg.models.scene.model import CERTAINTY, SceneModel
-from mudg.models.scene.nodes import RigidNode, StaticNode
-from mudg.models.scene.sides import with_closed_sides
-from mudg.stages.editing.assets import complete_asset
-from mudg.stages.editing.checks import shown_anew
-from mudg.stages.editing.plan import Actor, EditSources, EditWorld, plan_edits
+from mudg.editing.assets import complete_asset
+from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits, shown_anew
+from mudg.editing.script import parse_edits
+from mudg.editing.street import with_closed_sides
+from mudg.gaussians.model import CERTAINTY, SceneModel
+from mudg.gaussians.nodes import RigidNode, StaticNode
+from mudg.gaussians.start import SH_C0
 
 SIZE = (4.0, 1.8, 1.5)
 CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)

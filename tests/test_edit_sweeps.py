@@ -8,12 +8,11 @@ import pytest
 from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import FusedCloud, PointCloud, Sweep, SweepPoints
-from mudg.core import beams
-from mudg.core.edit import Motion
-from mudg.core.ground import HeightMap
-from mudg.data.edits import parse_edits
-from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
-from mudg.stages.editing.swept import edited_points
+from mudg.core import lidar as beams
+from mudg.core.edit import HeightMap, Motion
+from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
+from mudg.editing.recorded import edited_points
+from mudg.editing.script import parse_edits
 
 SIZE = (4.0, 2.0, 1.6)
 SENSOR = geometry.yaw_matrix(0.0, (0, 0, 2.0))

@@ -14,15 +14,14 @@ from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.edits import parse_edits
-from mudg.models.scene.initial import SH_C0
-from mudg.models.scene.model import CERTAINTY, SceneModel
-from mudg.models.scene.nodes import RigidNode, StaticNode
-from mudg.models.scene.shadows import continued, shaded_cells
-from mudg.models.scene.sky import SkyNode
-from mudg.models.scene.uncovered import SHOWN, Hidden, noted, shown_by, without_traces
-from mudg.stages.editing.apply import hidden_by
-from mudg.stages.editing.plan import Actor, EditSources, EditWorld, plan_edits
+from mudg.editing.apply import hidden_by
+from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits
+from mudg.editing.script import parse_edits
+from mudg.editing.street import SHOWN, Hidden, continued, noted, shaded_cells, shown_by, without_traces
+from mudg.gaussians.model import CERTAINTY, SceneModel
+from mudg.gaussians.nodes import RigidNode, StaticNode
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.start import SH_C0
 
 SIZE = (4.0, 2.0, 1.5)
 CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)

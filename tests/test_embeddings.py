@@ -16,10 +16,10 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.core import feature_distances
-from mudg.models import clip_image, dinov2
-from mudg.pages import score_tables
-from mudg.stages.config import ScoreConfig
-from mudg.stages.scoring.embeddings import subject_consistency
+from mudg.editing.view_settings import ScoreConfig
+from mudg.networks import clip_image, dinov2
+from mudg.scoring import tables as score_tables
+from mudg.scoring.sets import subject_consistency
 from mudg.steps.score import Score
 
 

@@ -23,26 +23,25 @@ from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.types import View
-from mudg.core.edit import Motion
-from mudg.core.ground import HeightMap
+from mudg.baselines.bezier import BezierNode
+from mudg.baselines.pvg import VibrationNode, starting_columns
+from mudg.core.edit import HeightMap, Motion
 from mudg.core.metrics import psnr
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.exporters.colmap import colmap_files, rig_frames, sensors_from_rig
-from mudg.data.exporters.nerfstudio import nerfstudio_files
-from mudg.data.splats import formats
-from mudg.data.splats.cloud import SplatCloud
-from mudg.models.scene.bezier import BezierNode
-from mudg.models.scene.model import SceneModel, compose
-from mudg.models.scene.nodes import DeformableNode, RigidNode
-from mudg.models.scene.vibration import VibrationNode, starting_columns
-from mudg.stages.config import ExportConfig, ImportConfig
-from mudg.stages.editing.assets import read_asset
-from mudg.stages.editing.carried import background_of
-from mudg.stages.editing.plan import EditWorld, place_background
-from mudg.stages.editing.runs import find_run
-from mudg.stages.exporting import export, scenes
-from mudg.stages.fit import render_view
-from mudg.stages.fitting.storage import load_model, save_model
+from mudg.editing.assets import read_asset
+from mudg.editing.carried import background_of
+from mudg.editing.plan import EditWorld, place_background
+from mudg.editing.runs import find_run
+from mudg.exporting import export
+from mudg.exporting import export as scenes
+from mudg.exporting.settings import ExportConfig, ImportConfig
+from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, rig_frames, sensors_from_rig
+from mudg.formats.splats import formats
+from mudg.formats.splats.cloud import SplatCloud
+from mudg.gaussians.fit import render_view
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.nodes import DeformableNode, RigidNode
+from mudg.gaussians.storage import load_model, save_model
 from mudg.steps.asset import AssetImport
 from mudg.steps.export import Export
 
@@ -425,7 +424,7 @@ def text_of(content: bytes, place: int) -> tuple[str, int]:
 
 
 def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg.data.exporters import foxglove, mcap
+    from mudg.formats.exporters import foxglove, mcap
 
     monkeypatch.setattr(mcap, "CHUNK_BYTES", 20_000)  # several chunks
     street = ToyStreet(times=[0.5, 0.6, 0.7], car_start=(8.0, 1.0), car_velocity=(3.0, 0.0))

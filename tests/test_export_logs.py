@@ -20,13 +20,14 @@ from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, ResourceError
 from mudg.base.types import PointCloud, Scene
-from mudg.data.exporters import cdr, mcap, ros2
-from mudg.data.exporters.log_records import LogRecords
-from mudg.data.scene import read_points
-from mudg.data.scene.files import open_files
-from mudg.stages.config import ExportConfig
-from mudg.stages.exporting import export
-from mudg.stages.fitting.storage import save_model
+from mudg.exporting import export
+from mudg.exporting.settings import ExportConfig
+from mudg.formats.exporters import mcap, ros2
+from mudg.formats.exporters import ros2 as cdr
+from mudg.formats.exporters.log_records import LogRecords
+from mudg.gaussians.storage import save_model
+from mudg.scene.files import open_files
+from mudg.scene.read import read_points
 from mudg.steps.export import Export
 
 

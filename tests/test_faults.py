@@ -20,8 +20,7 @@ from toy_clips import tiny, write_clips
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import ResourceError
-from mudg.base.replacement import Replacement
-from mudg.base.run_folder import RunDir, VerbOutput
+from mudg.base.run_folder import Replacement, RunDir, VerbOutput
 from mudg.steps.learn import Learn
 
 OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))

@@ -12,16 +12,16 @@ from torch.nn import functional
 from toy_clips import made_up_clip, with_patch
 
 from mudg.base.errors import UsageError
-from mudg.models import diffusion
-from mudg.models.diffusion import SampleRequest
-from mudg.models.mdm import files
-from mudg.models.mdm import finisher as finishing
-from mudg.models.mdm import model as mdm
-from mudg.models.mdm.finisher import Finisher, Made, finish_in_tiles, with_detail
-from mudg.models.mdm.model import BatchPart, LossSettings
-from mudg.models.mdm.network import ConditionPixels, Refined
-from mudg.models.mdm.stacked import Stacked
-from mudg.stages.learning.models import draw_weights
+from mudg.diffusion import files
+from mudg.diffusion import finisher as finishing
+from mudg.diffusion import model as mdm
+from mudg.diffusion import requests as diffusion
+from mudg.diffusion.finisher import Finisher, Made, finish_in_tiles, with_detail
+from mudg.diffusion.model import BatchPart, LossSettings
+from mudg.diffusion.network import ConditionPixels, Refined
+from mudg.diffusion.requests import SampleRequest
+from mudg.diffusion.stacked import Stacked
+from mudg.diffusion.training.models import draw_weights
 
 FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
 

@@ -23,19 +23,20 @@ from mudg.base.palette import ID
 from mudg.base.types import Gaussians, View
 from mudg.core import metrics, trajectory
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.cloudfile import read_fused, write_fused
-from mudg.data.observations import ObservationWriter
-from mudg.data.scene import read_scene
-from mudg.models.scene.appearance import Appearance
-from mudg.models.scene.model import SceneModel
-from mudg.models.scene.nodes import RigidNode
-from mudg.stages import fit
-from mudg.stages.config import FitConfig, run_preset
-from mudg.stages.fitting import start as fit_start
-from mudg.stages.fitting import trust as fit_trust
-from mudg.stages.fitting import views as fit_views
-from mudg.stages.fitting.finite import FiniteCheck
+from mudg.gaussians import fit
+from mudg.gaussians import start as fit_start
+from mudg.gaussians import trust as fit_trust
+from mudg.gaussians import views as fit_views
+from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.schedule import FiniteCheck
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
+from mudg.steps.settings.presets import run_preset
 
 SIZE = (60, 40)
 FRAMES = 6
@@ -487,7 +488,7 @@ def test_learning_rates_follow_the_length_of_the_run():
 def test_the_methods_that_can_be_fitted_are_those_of_the_configuration():
     from typing import get_args, get_type_hints
 
-    from mudg.methods import METHODS
+    from mudg.gaussians.methods import METHODS
 
     fitted = {name: row for name, row in METHODS.items() if row.made_by == "render"}
     assert set(fitted) == set(get_args(get_type_hints(FitConfig)["method"]))

@@ -18,12 +18,12 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.core import metrics, trajectory
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.cloudfile import write_fused
-from mudg.data.observations import ObservationWriter
-from mudg.models.scene.appearance import Appearance
-from mudg.stages import fit
-from mudg.stages.config import FitConfig
-from mudg.stages.fitting import continued
+from mudg.gaussians import fit
+from mudg.gaussians import storage as continued
+from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.clouds import write_fused
+from mudg.scene.observations import ObservationWriter
 from mudg.steps.fit import Fit
 
 SIZE = (60, 40)

@@ -26,26 +26,36 @@ from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.benchmarks import loop, rows
 from mudg.benchmarks import poses as bench_poses
+from mudg.benchmarks.settings import BenchConfig
 from mudg.core import native_ops
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.observations import read_observations
-from mudg.models.scene.appearance import Appearance
-from mudg.models.scene.densify import DensifySettings, DensifyStats, densify
-from mudg.models.scene.mcmc import McmcSettings, drift, order_of_place, relocate_and_grow
-from mudg.models.scene.model import SceneModel, compose
-from mudg.models.scene.nodes import StaticNode
-from mudg.models.scene.sky import SkyNode
-from mudg.stages import fit, score
-from mudg.stages.config import BenchConfig, FitConfig, RenderConfig, RunConfig, ScoreConfig, with_device
-from mudg.stages.config.fit import VirtualConfig
-from mudg.stages.fitting.finite import FiniteCheck
-from mudg.stages.fitting.perception import perception_of
-from mudg.stages.fitting.planes import render_planes
+from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.gaussians import fit
+from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.densify import (
+    DensifySettings,
+    DensifyStats,
+    McmcSettings,
+    densify,
+    drift,
+    order_of_place,
+    relocate_and_grow,
+)
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.nodes import StaticNode
+from mudg.gaussians.perception import perception_of
+from mudg.gaussians.rendering import render_planes
+from mudg.gaussians.schedule import FiniteCheck
+from mudg.gaussians.settings import FitConfig, VirtualConfig
+from mudg.gaussians.sky import SkyNode
+from mudg.scene.observations import read_observations
+from mudg.scoring import score
 from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
 from mudg.steps.score import Score
+from mudg.steps.settings.run import RunConfig, with_device
 
 SIZE, FRAMES = (36, 24), 4
 PRETEND = torch.device("pretend", 0)
@@ -211,17 +221,17 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
     for step, copied in steps.of.items():
         there = [copy for copy in copied if copy.way == "there"]
         large = [copy for copy in there if copy.values > NUMBERS]
-        assert {copy.where.partition(":")[0] for copy in large} == {"stages/fitting/views.py"}, step
+        assert {copy.where.partition(":")[0] for copy in large} == {"gaussians/views.py"}, step
         assert all(
             copy.values in {n * count for n in pixels for count in (1, 3)} or copy.values < 1000 for copy in large
         )
         back = [copy for copy in copied if copy.way == "back"]
         assert not [copy for copy in copied if copy.way == "wait"], step
         if step > 1:  # at first the tracks' offsets come back and the rows of every node are counted
-            assert [copy.where for copy in back] == ["stages/fitting/finite.py:refuse"], step
+            assert [copy.where for copy in back] == ["gaussians/schedule.py:refuse"], step
             assert back[0].values < 100
     late = [copy for copy in steps.of[5] if copy.way == "there" and copy.values <= NUMBERS]
-    assert all(copy.where == "models/scene/nodes.py:_sent" for copy in late), late
+    assert all(copy.where == "gaussians/nodes.py:_sent" for copy in late), late
 
 
 def test_densification_brings_no_rows_back(plain_fit):
@@ -250,10 +260,10 @@ def test_densification_brings_no_rows_back(plain_fit):
             )
             if found:
                 assert sum(found.values()) > found["rows"], found
-        assert {copy.where for copy in noted["densify"]} == {"models/scene/densify.py:_halves"}
+        assert {copy.where for copy in noted["densify"]} == {"gaussians/densify.py:_halves"}
         assert not noted["relocate"]
-        assert [copy.where for copy in seen if copy.way == "wait"] == ["models/scene/mcmc.py:drift"]
-        assert {copy.where for copy in noted["drift"]} == {"models/scene/mcmc.py:drift"}
+        assert [copy.where for copy in seen if copy.way == "wait"] == ["gaussians/densify.py:drift"]
+        assert {copy.where for copy in noted["drift"]} == {"gaussians/densify.py:drift"}
 
 
 def test_what_is_not_finite_is_found_in_one_look(world):
@@ -307,7 +317,7 @@ def test_a_fitted_scene_moves_and_renders_the_same(plain_fit):
         again = moved.to(CPU)
         assert fit.render_view(moved.without_nodes(["walker"]), view, raster).rgb.device == CPU
     large = [copy for copy in seen if copy.values > NUMBERS]
-    assert {(copy.way, copy.where.partition(":")[0]) for copy in large} == {("back", "stages/fitting/rendering.py")}
+    assert {(copy.way, copy.where.partition(":")[0]) for copy in large} == {("back", "gaussians/rendering.py")}
     for name in ("rgb", "depth", "semantics", "confidence", "mask"):
         torch.testing.assert_close(getattr(made, name), getattr(here, name), atol=1e-6, rtol=1e-6, equal_nan=True)
     assert planes.color.device == planes.semantics.device == CPU
@@ -457,7 +467,7 @@ def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypa
         Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config).run()
     with pretend_device(), transfers() as seen:
         Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_there", settings=replace(config, device="pretend")).run()
-    assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"models/featnets.py"}
+    assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"networks/featnets.py"}
     found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
     values = [document["by_distance"][0]["values"] for document in found]
     assert values[0]["perceptual"] == pytest.approx(values[1]["perceptual"], rel=1e-5)

@@ -10,8 +10,7 @@ import torch
 
 from mudg.base import geometry
 from mudg.base.types import Camera, View
-from mudg.stages.fitting.halved import LEAST_PX, HalvedViews, halved
-from mudg.stages.fitting.views import LidarPixels, StoredView
+from mudg.gaussians.views import LEAST_PX, HalvedViews, LidarPixels, StoredView, halved
 
 WIDTH, HEIGHT = 241, 196
 RNG = np.random.default_rng(0)
@@ -73,7 +72,7 @@ def test_only_virtual_views_of_the_first_steps_are_halved(keep: bool) -> None:
 
 
 def test_large_views_are_halved_at_every_step_unless_none_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mudg.stages.fitting.halved.WHOLE_PIXELS", WIDTH * HEIGHT - 1)
+    monkeypatch.setattr("mudg.gaussians.views.WHOLE_PIXELS", WIDTH * HEIGHT - 1)
     view = stored()
     for until, side in ((10.0, WIDTH // 2), (0.0, WIDTH)):
         sizes = HalvedViews(until, keep=True)

@@ -8,12 +8,12 @@ from test_score_metrics import lpips_state
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
+from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
-from mudg.core.perceptual import lpips_distance, unit_features
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
-from mudg.models.mdm import files
-from mudg.stages.config.fit import VirtualConfig
-from mudg.stages.fitting.perception import perception_of
+from mudg.diffusion import files
+from mudg.gaussians.perception import perception_of
+from mudg.gaussians.settings import VirtualConfig
+from mudg.networks.featnets import CodecFeatures, PerceptualDistance
 
 
 def random(seed: int, *shape: int) -> torch.Tensor:

@@ -13,11 +13,11 @@ from mudg.base.config import to_dict
 from mudg.base.run_folder import RunDir
 from mudg.benchmarks.poses import pose_errors
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.scene import read_scene
-from mudg.models.scene.model import compose
-from mudg.stages import fit
-from mudg.stages.fitting import poses as fit_poses
-from mudg.stages.fitting.objects import outline_mask
+from mudg.gaussians import fit
+from mudg.gaussians import poses as fit_poses
+from mudg.gaussians.model import compose
+from mudg.gaussians.rendering import outline_mask
+from mudg.scene.read import read_scene
 
 SIZE, FRAMES = (96, 64), 6
 RASTER = RasterConfig(near_m=0.2)

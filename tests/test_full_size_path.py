@@ -13,9 +13,9 @@ from test_score_metrics import lpips_state
 from toy_published import TINY, tiny_checkpoint
 
 from mudg.base import store
-from mudg.data.observations import list_observation_sets, read_observations
-from mudg.models.published import files as published_files
-from mudg.stages.config import PRESETS
+from mudg.diffusion.published import model as published_files
+from mudg.scene.observations import list_observation_sets, read_observations
+from mudg.steps.settings.presets import PRESETS
 
 TOY = "import sys; from toy_published import TINY; from mudg.stages import convert; convert.PublishedConfig = lambda: TINY\n"
 """Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""

@@ -19,7 +19,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
-from mudg.core.fusion import (
+from mudg.core.fusion import (  # fmt: skip
     STATIC,
     CloudAccumulator,
     FusionReport,
@@ -31,14 +31,14 @@ from mudg.core.fusion import (
     points_in_box,
     separate,
     voxel_keys,
-)  # fmt: skip
+)
 from mudg.core.project import ProjectConfig, project_cloud
-from mudg.data.cloudfile import read_fused, write_fused
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_image, read_points
-from mudg.stages import fuse
-from mudg.stages.config import FuseConfig
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene import fuse
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.read import read_image, read_points
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fuse import Fuse
 
 RULES = FusionRules(min_object_points=1)

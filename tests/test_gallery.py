@@ -14,7 +14,7 @@ import mudg
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.stages.viewing import gallery
+from mudg.viewer import gallery
 
 METRICS = [
     {"name": "psnr", "title": "PSNR", "unit": "dB", "better": "higher"},

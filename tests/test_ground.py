@@ -7,15 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mudg.base.geometry import yaw_matrix
-from mudg.models.labels.ground import (
-    CELL_M,
-    above_plane,
-    distance_to_path,
-    driven_path,
-    fit_ground,
-    ground_near,
-    map_ground,
-)
+from mudg.labels.ground import CELL_M, above_plane, distance_to_path, driven_path, fit_ground, ground_near, map_ground
 
 KERB_AT_M = 4.0
 

@@ -18,10 +18,11 @@ from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Gaussians, Render, View
-from mudg.core.raster import gsplat_cuda, gsplat_package
+from mudg.core.raster import gsplat_cuda
+from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import ONLY_GSPLAT, RasterConfig, rasterize
-from mudg.stages import doctor
+from mudg.steps import diagnosis as doctor
 
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
 IMAGES = ("rgb", "depth", "alpha", "extra")

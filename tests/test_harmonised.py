@@ -17,35 +17,37 @@ from toy_world import fused_cloud, write_scene
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.base.renders import RenderPlanes
-from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, View
+from mudg.base.types import Condition, FusedCloud, Observation, Photo, PointCloud, RenderPlanes, View
 from mudg.base.weather_settings import Conditions
 from mudg.benchmarks import run as bench
+from mudg.benchmarks.settings import BenchConfig
 from mudg.core.edit import Motion
 from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
-from mudg.core.weather.tone import SRGB
-from mudg.data.clips import vacated as clip_parts
-from mudg.data.clips.ablated import ConditionSources, conditions_of
-from mudg.data.clips.condition import ConditionRules, build_conditions, image_tensor
-from mudg.data.clips.weathered import InWeather
-from mudg.data.cloudfile import read_fused, write_fused
-from mudg.data.edits import parse_edits
-from mudg.data.observations import read_observations
-from mudg.data.scene import read_image, read_label, read_scene
-from mudg.models.diffusion import SampleRequest, StartClip
-from mudg.models.mdm import files
-from mudg.models.mdm.codec import CodecConfig
-from mudg.models.mdm.model import MDM, MDMConfig
-from mudg.models.published.model import PublishedMDM
-from mudg.stages import fit
-from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig, RenderConfig, SynthesizeConfig
-from mudg.stages.editing import harmonised
-from mudg.stages.editing.harmonised import Touched, guarded, pasted, soft_edge
-from mudg.stages.editing.harmonised_weather import corrected
-from mudg.stages.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
-from mudg.stages.editing.vacated import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
-from mudg.stages.learning.views import recorded_images
+from mudg.core.weather.light import SRGB
+from mudg.diffusion import files
+from mudg.diffusion.clips import condition as clip_parts
+from mudg.diffusion.clips.condition import ConditionRules, build_conditions, image_tensor
+from mudg.diffusion.clips.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.published.model import PublishedMDM
+from mudg.diffusion.requests import SampleRequest, StartClip
+from mudg.diffusion.settings.harmonize import HarmonizeConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.views import recorded_images
+from mudg.editing import harmonised
+from mudg.editing.harmonised import Touched, corrected, guarded, pasted, soft_edge
+from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
+from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
+from mudg.editing.script import parse_edits
+from mudg.editing.settings import EditConfig
+from mudg.editing.view_settings import RenderConfig
+from mudg.gaussians import fit
+from mudg.networks.codec import CodecConfig
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.labels import read_label
+from mudg.scene.observations import read_observations
+from mudg.scene.read import read_image, read_scene
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews

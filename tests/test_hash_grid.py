@@ -10,7 +10,7 @@ import torch
 from mudg import native
 from mudg.base import seeds
 from mudg.base.errors import InputError, UsageError
-from mudg.core.hash_grid import HashGrid, encode, torch_encode
+from mudg.core.grids import HashGrid, encode, torch_encode
 
 GRIDS = [
     HashGrid(3, 3, 2, 2, 20, 8),

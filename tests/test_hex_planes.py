@@ -8,7 +8,7 @@ import torch
 from mudg import native
 from mudg.base import seeds
 from mudg.base.errors import InputError
-from mudg.core.hex_planes import NATIVE_FEATURES, PlaneSizes, look_up, torch_look_up
+from mudg.core.grids import NATIVE_FEATURES, PlaneSizes, look_up, torch_look_up
 
 Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 

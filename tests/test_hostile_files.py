@@ -23,9 +23,9 @@ from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.plain_yaml import DEEPEST, LARGEST_BYTES, parse_yaml
-from mudg.data.edits.script import parse_edits
-from mudg.stages.config import IngestConfig
-from mudg.stages.learning.scene_list import read_list
+from mudg.diffusion.training.scene_list import read_list
+from mudg.editing.script import parse_edits
+from mudg.formats.settings import IngestConfig
 from mudg.steps.ingest import Ingest
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")

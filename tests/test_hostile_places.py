@@ -12,10 +12,10 @@ import pytest
 
 from mudg import app
 from mudg.base.errors import InputError
-from mudg.data.city.config import CityConfig
-from mudg.data.scene import read_scene
-from mudg.stages.config import IngestConfig
-from mudg.stages.score_truth import truth_of
+from mudg.city.config import CityConfig
+from mudg.formats.settings import IngestConfig
+from mudg.scene.read import read_scene
+from mudg.scoring.truth import truth_of
 from mudg.steps.ingest import Ingest
 
 GONE = ["doctor", "fuse scene --out out", "view run", "convert a --to b", "run city --out out", "batch status out"]

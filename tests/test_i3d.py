@@ -12,12 +12,14 @@ import toy_views
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.data.scene import read_scene
-from mudg.models import i3d
-from mudg.pages import page, score_tables
-from mudg.stages.config import ScoreConfig
-from mudg.stages.scoring import distributions, videos
+from mudg.editing.view_settings import ScoreConfig
+from mudg.networks import i3d
+from mudg.scene.read import read_scene
+from mudg.scoring import sets as distributions
+from mudg.scoring import sets as videos
+from mudg.scoring import tables as score_tables
 from mudg.steps.score import Score
+from mudg.viewer import report as page
 
 
 def made_up() -> dict[str, torch.Tensor]:

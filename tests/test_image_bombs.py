@@ -15,14 +15,14 @@ from PIL import Image
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera
-from mudg.data.city import photos
-from mudg.data.importers.kitti360 import importer as kitti360
-from mudg.data.importers.waymo import sensors as waymo
-from mudg.data.observations import read_image_file
-from mudg.data.scene import labels
-from mudg.data.scene.read import check_image, decode_image
-from mudg.pages import gallery
-from mudg.stages.scoring.detections import read_mask
+from mudg.city import photos
+from mudg.formats.importers import kitti360
+from mudg.formats.importers.waymo import sensors as waymo
+from mudg.scene import labels
+from mudg.scene.observations import read_image_file
+from mudg.scene.read import check_image, decode_image
+from mudg.scoring.detections import read_mask
+from mudg.viewer import gallery
 
 CAMERA = Camera("front", 60_000, 60_000, 100.0, 100.0, 30_000.0, 30_000.0)
 

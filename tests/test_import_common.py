@@ -12,9 +12,9 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, yaw_matrix
 from mudg.base.types import Camera
-from mudg.data.importers import common, images
-from mudg.data.importers.layout import number_ranges
-from mudg.data.importers.options import ImportOptions, parse_resolution
+from mudg.formats.importers import common, images
+from mudg.formats.importers.common import ImportOptions, parse_resolution
+from mudg.formats.importers.layout import number_ranges
 
 CAMERA = Camera("front", 96, 64, 70.0, 72.0, 47.0, 33.0)
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from mudg.base import seeds
 from mudg.base.errors import InputError
-from mudg.models import inception
+from mudg.networks import inception
 
 
 @pytest.fixture(scope="module")

@@ -16,13 +16,15 @@ from mudg import app, native
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
 from mudg.base.run_folder import RunDir
-from mudg.data.city import CityConfig
-from mudg.data.importers import IMPORTERS, files_of
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_image, read_label, read_points, read_scene, write_zip
-from mudg.data.scene.schema import scene_to_json_text
-from mudg.stages import ingest
-from mudg.stages.config import IngestConfig
+from mudg.city.config import CityConfig
+from mudg.formats import ingest
+from mudg.formats.importers import IMPORTERS, files_of
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.settings import IngestConfig
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.schema import scene_to_json_text
+from mudg.scene.write import write_zip
 from mudg.steps.ingest import Ingest
 
 needs_native = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")

@@ -23,15 +23,15 @@ from toy_world import camera, fused_cloud, truth, view_at, write_scene
 from mudg.base import scratch
 from mudg.base.errors import ResourceError
 from mudg.core import trajectory
-from mudg.data.cloudfile import write_fused
-from mudg.data.observations import ObservationWriter
-from mudg.data.scene import read_scene
-from mudg.models.scene.sky import SkyNode
-from mudg.stages import fit
-from mudg.stages.fitting import kept, trust
-from mudg.stages.fitting import views as fit_views
-from mudg.stages.fitting.start import StartPoints
-from mudg.stages.fitting.views import LidarPixels, StoredView, TrainView, ViewSet
+from mudg.gaussians import fit, trust
+from mudg.gaussians import views as fit_views
+from mudg.gaussians import views as kept
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.start import StartPoints
+from mudg.gaussians.views import LidarPixels, StoredView, TrainView, ViewSet
+from mudg.scene.clouds import write_fused
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6
@@ -40,7 +40,7 @@ OPTIONAL = ("channels", "sky", "mask", "lidar", "depth", "confidence")
 
 
 def threads_at_work() -> int:
-    """Threads of this process but for the one that looks at memory (`base/usage.py`): it ends a moment after the last meter."""
+    """Threads of this process but for the one that looks at memory (`base/memory.py`): it ends a moment after the last meter."""
     return sum(thread.name != "memory meter" for thread in threading.enumerate())
 
 

@@ -14,12 +14,11 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import Scene, View
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.kitti import boxes as kitti_boxes
-from mudg.data.importers.kitti.calib import read_calibration_day, read_calibration_text
-from mudg.data.importers.kitti.poses import read_timestamps
-from mudg.data.importers.options import ImportOptions, holdout_split, parse_frame_range
-from mudg.data.scene import read_image, read_points
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions, holdout_split, parse_frame_range
+from mudg.formats.importers.kitti import files as kitti_boxes
+from mudg.formats.importers.kitti.files import read_calibration_day, read_calibration_text, read_timestamps
+from mudg.scene.read import read_image, read_points
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:

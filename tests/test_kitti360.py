@@ -17,11 +17,11 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.kitti360.boxes import read_boxes
-from mudg.data.importers.kitti360.calib import read_calibration
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_image, read_label, read_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.kitti360 import read_boxes, read_calibration
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points
 
 pytestmark = roundtrip.needs_native
 SAME = {"front": "front", "front_left": "front_stereo"}

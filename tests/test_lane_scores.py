@@ -7,7 +7,7 @@ import pytest
 
 from mudg.base import geometry
 from mudg.base.types import Camera, View
-from mudg.core import lane_scores
+from mudg.core import street_scores as lane_scores
 
 # x right, y down, z forward in the world's x forward, y left, z up; 1.5 m above the ground.
 POSE = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]], np.float64)

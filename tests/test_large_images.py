@@ -11,13 +11,14 @@ import torch
 from mudg.base.crop import cropped
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
-from mudg.core import flicker
+from mudg.core import metrics as flicker
 from mudg.core.metrics import Pair
-from mudg.models import featnets
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
-from mudg.models.mdm.codec import CodecConfig, PatchCodec
-from mudg.stages import render, synthesize
-from mudg.stages.config import SynthesizeConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.editing import render
+from mudg.networks import featnets
+from mudg.networks.codec import CodecConfig, PatchCodec
+from mudg.networks.featnets import CodecFeatures, PerceptualDistance
+from mudg.steps import synthesis as synthesize
 
 
 def pair_of(height: int, width: int, *, masked: bool) -> Pair:

@@ -9,13 +9,12 @@ from toy_clips import WINDOW, tiny, with_settings, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.data.clips import from_city
-from mudg.data.clips import shards as clip_shards
-from mudg.models.diffusion import GeneratedClip
-from mudg.models.mdm import files
-from mudg.stages import learn
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import score as learn_score
+from mudg.diffusion import files, learn
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.requests import GeneratedClip
+from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion.training import score as learn_score
 from mudg.steps.learn import Learn
 
 

@@ -12,13 +12,11 @@ from toy_clips import WINDOW, tiny, write_clips
 from mudg.base import checkpoint
 from mudg.base.config import load
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.models.mdm import files
-from mudg.models.mdm.model import MDM, MDMConfig
-from mudg.stages import learn
-from mudg.stages.config import LearnConfig
-from mudg.stages.config.learn import LearnData, LearnNetwork
-from mudg.stages.learning import models as learn_models
-from mudg.stages.learning.state import TrainingState
+from mudg.diffusion import files, learn
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.settings.learn import LearnConfig, LearnData, LearnNetwork
+from mudg.diffusion.training import models as learn_models
+from mudg.diffusion.training.state import TrainingState
 from mudg.steps.learn import Learn
 
 
@@ -160,9 +158,8 @@ def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
 
 
 def test_a_step_has_clips_of_one_size() -> None:
-    from mudg.stages.config import LearnConfig
-    from mudg.stages.config.learn import LearnData
-    from mudg.stages.learning import clips as learn_clips
+    from mudg.diffusion.settings.learn import LearnConfig, LearnData
+    from mudg.diffusion.training import clips as learn_clips
 
     config = LearnConfig(data=LearnData(realism="varied"))
     sizes = learn_clips.sizes_of_cities(config)
@@ -178,7 +175,7 @@ def test_a_step_has_clips_of_one_size() -> None:
 
 
 def test_the_condition_of_freevs_is_made_of_cities_without_renders():
-    from mudg.stages.learning import clips as learn_clips
+    from mudg.diffusion.training import clips as learn_clips
 
     config = learn._checked_condition(LearnConfig(data=LearnData(condition="freevs")))
     rules = learn_clips.clip_rules(config)

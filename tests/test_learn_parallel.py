@@ -15,13 +15,13 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
-from mudg.models.mdm import files
-from mudg.models.mdm.model import MDM, BatchPart, LossSettings
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import models as learn_models
-from mudg.stages.learning import parallel as learn_parallel
-from mudg.stages.learning.parallel import Ranks
-from mudg.stages.learning.state import TrainingState, read_rows
+from mudg.diffusion import files
+from mudg.diffusion.model import MDM, BatchPart, LossSettings
+from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion.training import models as learn_models
+from mudg.diffusion.training import parallel as learn_parallel
+from mudg.diffusion.training.parallel import Ranks
+from mudg.diffusion.training.state import TrainingState, read_rows
 from mudg.steps.learn import Learn
 
 SAME = 2e-6

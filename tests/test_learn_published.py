@@ -17,20 +17,23 @@ from toy_scene import ToyStreet
 from mudg.base import crop, palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, SparseDepth
-from mudg.data.clips import from_city, from_log
-from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import ConditionRules, build_conditions, filled_depth
-from mudg.data.clips.from_log import LogClipRules, LogSource
-from mudg.data.observations import read_observations
-from mudg.data.scene import read_scene
-from mudg.models.mdm.model import BatchPart, LossSettings
-from mudg.models.published import files as published_files
-from mudg.models.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
-from mudg.stages import convert, learn
-from mudg.stages.config import FuseConfig, LearnConfig, SynthesizeConfig
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import models as learn_models
-from mudg.stages.learning.views import recorded_images
+from mudg.diffusion import learn
+from mudg.diffusion.clips import from_city, from_log
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.condition import ConditionRules, build_conditions, filled_depth
+from mudg.diffusion.clips.from_log import LogClipRules, LogSource
+from mudg.diffusion.model import BatchPart, LossSettings
+from mudg.diffusion.published import model as published_files
+from mudg.diffusion.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
+from mudg.diffusion.settings.learn import LearnConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion.training import models as learn_models
+from mudg.diffusion.views import recorded_images
+from mudg.scene.observations import read_observations
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.steps import conversion as convert
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn
 from mudg.steps.synthesize import Synthesize

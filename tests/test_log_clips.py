@@ -13,16 +13,20 @@ from toy_scene import ToyStreet
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source, View
 from mudg.core import losses
-from mudg.data.clips import from_log
-from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.from_city import HELD_OUT
-from mudg.data.clips.from_log import LogClipRules, LogSource
-from mudg.data.scene import SceneWriter, photographs, read_image, read_label, read_points, read_scene
-from mudg.models.mdm.model import MDM
-from mudg.stages.adapting import lessons
-from mudg.stages.config import AdaptConfig, FuseConfig, LearnConfig
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning import models as learn_models
+from mudg.diffusion import adapt as lessons
+from mudg.diffusion.clips import from_log
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.from_city import HELD_OUT
+from mudg.diffusion.clips.from_log import LogClipRules, LogSource
+from mudg.diffusion.model import MDM
+from mudg.diffusion.settings.adapt import AdaptConfig
+from mudg.diffusion.settings.learn import LearnConfig
+from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion.training import models as learn_models
+from mudg.scene.labels import photographs, read_label
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.scene.write import SceneWriter
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn
 

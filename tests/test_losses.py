@@ -12,8 +12,8 @@ from torch.nn import functional
 
 from mudg.base.errors import InputError
 from mudg.core import losses
-from mudg.models import featnets
-from mudg.models.featnets import FilterBank
+from mudg.networks import featnets
+from mudg.networks.featnets import FilterBank
 
 
 def image(seed: int, shape: tuple[int, ...] = (3, 14, 17), dtype: torch.dtype = torch.float64) -> Tensor:

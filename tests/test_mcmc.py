@@ -12,8 +12,8 @@ from mudg.base import geometry
 from mudg.base.types import Camera, Gaussians, View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
-from mudg.models.scene import mcmc
-from mudg.models.scene.mcmc import (
+from mudg.gaussians import densify as mcmc
+from mudg.gaussians.densify import (
     McmcSettings,
     drift,
     order_of_place,
@@ -22,8 +22,8 @@ from mudg.models.scene.mcmc import (
     stack_of,
     systematic_counts,
 )
-from mudg.models.scene.model import SceneModel
-from mudg.models.scene.nodes import RigidNode, StaticNode
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode, StaticNode
 
 SETTINGS = McmcSettings(start=10, stop=100, every=10, max_rows=1000, growth=0.0)
 NOWHERE = -9.0  # a logit of opacity 0.0001

@@ -9,13 +9,14 @@ import torch
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Camera, Clip, Condition, View
 from mudg.core import noise
-from mudg.models import diffusion
-from mudg.models.diffusion import SampleRequest
-from mudg.models.mdm import codec, files, network
-from mudg.models.mdm import extended as extending
-from mudg.models.mdm import model as mdm
-from mudg.models.mdm.codec import CodecConfig
-from mudg.models.mdm.model import MDM, BatchPart, LossSettings, MDMConfig
+from mudg.diffusion import extended as extending
+from mudg.diffusion import files, network
+from mudg.diffusion import model as mdm
+from mudg.diffusion import requests as diffusion
+from mudg.diffusion.model import MDM, BatchPart, LossSettings, MDMConfig
+from mudg.diffusion.requests import SampleRequest
+from mudg.networks import codec
+from mudg.networks.codec import CodecConfig
 
 TINY = MDMConfig(
     widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,

@@ -16,7 +16,7 @@ from mudg import app
 from mudg.base import log, store
 from mudg.base.errors import InputError, MudgError, UsageError
 from mudg.base.records import StrictRecord, parse_record
-from mudg.data.edits import parse_edits
+from mudg.editing.script import parse_edits
 
 FORGED = "\x1b]0;title\x07\x1b[31m\nerror: forged\r\u2028\u202eline\x9b1m\u2066\x00"
 OBEYED = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]|\nerror: forged")

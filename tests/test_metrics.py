@@ -9,7 +9,8 @@ import torch
 
 from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, ID
-from mudg.core import flicker, metrics
+from mudg.core import metrics
+from mudg.core import metrics as flicker
 from mudg.core.losses import ssim_map
 from mudg.core.metrics import METRICS, Pair
 

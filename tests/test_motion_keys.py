@@ -18,11 +18,10 @@ import write_nuplan
 from mudg.base.errors import InputError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import EgoPath, Scene, Track
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.custom import importer as custom
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import motion
-from mudg.data.scene.check import check_records
+from mudg.formats.importers import IMPORTERS, custom
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene import motion
+from mudg.scene.check import check_records
 
 RADIUS_M, SPEED_M_S = 12.0, 8.0
 LOST_S = (0.62, 1.88)

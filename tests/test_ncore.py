@@ -24,15 +24,17 @@ from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
-from mudg.data.exporters.log_records import LogRecords
-from mudg.data.exporters.ncore import sensor_ids, write_ncore
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.images import brown_conrady, equidistant, fit_images
-from mudg.data.importers.ncore import container, importer
-from mudg.data.importers.options import ImportOptions
-from mudg.data.ncore import PoseKeys, euler_of, package, rotation_of
-from mudg.data.scene import read_label, read_points
-from mudg.data.scene.files import open_files
+from mudg.formats.exporters.log_records import LogRecords
+from mudg.formats.exporters.ncore import sensor_ids, write_ncore
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers import ncore as container
+from mudg.formats.importers import ncore as importer
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.images import brown_conrady, equidistant, fit_images
+from mudg.formats.ncore import PoseKeys, euler_of, package, rotation_of
+from mudg.scene.files import open_files
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_points
 
 try:
     package()
@@ -191,7 +193,7 @@ def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Pa
         return replace(read_points(truth, sweep), classes=classes[sweep.id])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mudg.data.exporters.ncore.read_label", lambda *_: bonnet)
+        patch.setattr("mudg.formats.exporters.ncore.read_label", lambda *_: bonnet)
         labelled = tuple(replace(frame, labels={"ego": frame.image}) for frame in shaken.frames)
         write_ncore(tmp_path, LogRecords(replace(shaken, frames=labelled), records(truth).picture, points))
     scene = ingest(tmp_path, tmp_path / "back")

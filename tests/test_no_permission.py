@@ -17,9 +17,9 @@ from test_gallery import run_of
 from toy_clips import tiny
 
 from mudg import app
-from mudg.stages.config import LearnConfig
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.viewing import gallery
+from mudg.diffusion.settings.learn import LearnConfig
+from mudg.diffusion.training import clips as learn_clips
+from mudg.viewer import gallery
 
 NOBODY = 65534
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="users are those of Unix")

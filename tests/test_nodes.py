@@ -15,18 +15,21 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Track, View
+from mudg.baselines.bezier import BezierNode
 from mudg.core import harmonics as core_harmonics
-from mudg.core import native_ops, quaternions
+from mudg.core import harmonics as quaternions
+from mudg.core import native_ops
 from mudg.core.raster import torch_twin
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.raster.request import harmonics
 from mudg.core.table import Table, torch_adam_columns
-from mudg.models.scene import initial, motion, nodes
-from mudg.models.scene import model as scene_model
-from mudg.models.scene.bezier import BezierNode
-from mudg.models.scene.model import SceneModel, compose
-from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
-from mudg.models.scene.sky import SkyNode
+from mudg.gaussians import model as scene_model
+from mudg.gaussians import nodes
+from mudg.gaussians import nodes as motion
+from mudg.gaussians import start as initial
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
+from mudg.gaussians.sky import SkyNode
 
 
 def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0.0) -> np.ndarray:

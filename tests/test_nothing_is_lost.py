@@ -25,29 +25,24 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import chain, page
 from mudg.benchmarks import run as bench
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city.config import CityConfig
 from mudg.core import trajectory
-from mudg.data.city import CityConfig
-from mudg.data.scene import read_scene, write_zip
-from mudg.models.mdm import files
-from mudg.models.mdm.codec import CodecConfig
-from mudg.models.mdm.model import MDM, MDMConfig
-from mudg.stages import (
-    convert,
-    ingest,
-)
-from mudg.stages.batches.listed import ListedRun, run_listed
-from mudg.stages.batches.plan import Entry
-from mudg.stages.config import (
-    AnnotateConfig,
-    BenchConfig,
-    ConvertConfig,
-    FuseConfig,
-    IngestConfig,
-    RenderConfig,
-    RunConfig,
-    ScoreConfig,
-    SynthesizeConfig,
-)
+from mudg.diffusion import files
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.fleet.listed import ListedRun, run_listed
+from mudg.fleet.plan import Entry
+from mudg.formats import ingest
+from mudg.formats.settings import IngestConfig
+from mudg.labels.settings import AnnotateConfig
+from mudg.networks.codec import CodecConfig
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.scene.write import write_zip
+from mudg.steps import conversion as convert
 from mudg.steps import pipeline
 from mudg.steps.annotate import Annotate
 from mudg.steps.convert import Convert
@@ -58,6 +53,7 @@ from mudg.steps.learn import Learn
 from mudg.steps.render import RenderViews
 from mudg.steps.run import Run
 from mudg.steps.score import DrawTruth, Score
+from mudg.steps.settings.run import RunConfig
 from mudg.steps.synthesize import Synthesize
 
 SMALL = MDMConfig(

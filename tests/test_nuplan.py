@@ -19,10 +19,10 @@ from PIL import Image
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.nuplan.database import open_log
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_image, read_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.nuplan import open_log
+from mudg.scene.read import read_image, read_points
 
 pytestmark = roundtrip.needs_native
 

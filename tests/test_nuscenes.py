@@ -17,11 +17,10 @@ from roundtrip import needs_native
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.nuscenes.sensors import camera_from_intrinsics, point_times, read_scan
-from mudg.data.importers.nuscenes.tables import find_records, iter_records
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.nuscenes import camera_from_intrinsics, find_records, iter_records, point_times, read_scan
+from mudg.scene.read import read_points
 
 Rows = list[dict[str, Any]]
 

@@ -11,7 +11,7 @@ import torch
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, View
-from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
 
 CAMERA = Camera("front", 8, 6, 5.0, 5.0, 4.0, 3.0)
 

@@ -21,13 +21,12 @@ from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.base.types import Photo, Scene, Track
 from mudg.core.fusion import SweepShots, fuse_sweeps
-from mudg.core.zbuffer import DrawLimits, PointLayer, draw_points
-from mudg.data.importers import IMPORTERS, RECOGNISERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.importers.pandaset.pandas_frame import read_frame
-from mudg.data.importers.pandaset.point_classes import CLASS_OF
-from mudg.data.scene import check_scene, image_point_classes, read_image, read_points, read_scene
-from mudg.data.scene.alignment import camera_alignment
+from mudg.core.project import DrawLimits, PointLayer, draw_points
+from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.pandaset import CLASS_OF, read_frame
+from mudg.scene.check import camera_alignment, check_scene, image_point_classes
+from mudg.scene.read import read_image, read_points, read_scene
 
 pytestmark = roundtrip.needs_native
 

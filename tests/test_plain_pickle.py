@@ -13,10 +13,10 @@ import numpy as np
 import pandas_pickles
 import pytest
 
+from mudg.base import plain_pickle
 from mudg.base.errors import InputError
-from mudg.data import plain_pickle
-from mudg.data.importers.pandaset import pandas_frame
-from mudg.data.plain_pickle import NUMPY_MAKERS, Array, as_list, read_pickle
+from mudg.base.plain_pickle import NUMPY_MAKERS, Array, as_list, read_pickle
+from mudg.formats.importers import pandaset as pandas_frame
 
 GOLDEN = Path(__file__).parent / "golden"
 

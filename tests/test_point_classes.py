@@ -14,8 +14,10 @@ from mudg.base import palette
 from mudg.base.errors import InputError
 from mudg.base.types import EgoPath, Photo, Scene, Source, SweepPoints
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
-from mudg.data.scene import SceneWriter, image_point_classes, read_points, read_scene
-from mudg.stages.config import AnnotateConfig
+from mudg.labels.settings import AnnotateConfig
+from mudg.scene.check import image_point_classes
+from mudg.scene.read import read_points, read_scene
+from mudg.scene.write import SceneWriter
 from mudg.steps.annotate import Annotate
 
 pytestmark = roundtrip.needs_native

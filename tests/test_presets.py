@@ -12,10 +12,11 @@ import mudg
 from mudg import app
 from mudg.base import config as configuration
 from mudg.base.errors import InputError, UsageError
-from mudg.stages import config as stage_config
-from mudg.stages.config import PRESETS, PresetName, RunConfig, run_preset
 from mudg.steps import pipeline
+from mudg.steps import settings as stage_config
 from mudg.steps.run import Run
+from mudg.steps.settings.presets import PRESETS, PresetName, run_preset
+from mudg.steps.settings.run import RunConfig
 
 NAMES = get_args(PresetName)
 

@@ -17,19 +17,21 @@ from mudg.base.records import parse_dataclass
 from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
-from mudg.data.observations import read_observations
-from mudg.models.diffusion import SampleRequest
-from mudg.models.published import clip, files
-from mudg.models.published import model as published
-from mudg.models.published.clip import ImageTower, TextTower, TowerConfig
-from mudg.models.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
-from mudg.models.published.model import PublishedConfig, WorkSplit
-from mudg.models.published.resampler import Resampler, ResamplerConfig
-from mudg.models.published.video_unet import VideoUNet, VideoUNetConfig
-from mudg.stages import convert
-from mudg.stages.config import ConvertConfig, FuseConfig, SynthesizeConfig
-from mudg.stages.learning import memory_plan
-from mudg.stages.learning.views import recorded_at_pose, recorded_images
+from mudg.diffusion.published import model as files
+from mudg.diffusion.published import model as published
+from mudg.diffusion.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
+from mudg.diffusion.published.model import PublishedConfig, WorkSplit
+from mudg.diffusion.published.video_unet import Resampler, ResamplerConfig, VideoUNet, VideoUNetConfig
+from mudg.diffusion.requests import SampleRequest
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.training import memory_plan
+from mudg.diffusion.views import recorded_at_pose, recorded_images
+from mudg.networks import clip
+from mudg.networks.clip import ImageTower, TextTower, TowerConfig
+from mudg.scene.observations import read_observations
+from mudg.scene.settings import FuseConfig
+from mudg.steps import conversion as convert
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize
 
@@ -478,9 +480,9 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
 
 def test_the_released_resizing(street):
     """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
-    from mudg.data.clips.condition import ConditionRules, build_conditions
-    from mudg.data.cloudfile import read_fused
-    from mudg.data.scene import read_scene
+    from mudg.diffusion.clips.condition import ConditionRules, build_conditions
+    from mudg.scene.clouds import read_fused
+    from mudg.scene.read import read_scene
 
     scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
     view = scene.frames_of("front")[0].view
@@ -497,7 +499,7 @@ def test_the_released_resizing(street):
 
 
 def test_the_reference_fits_only_where_it_was_taken(street):
-    from mudg.data.scene import read_scene
+    from mudg.scene.read import read_scene
 
     scene = read_scene(street / "scene")
     recorded = recorded_images(scene, SynthesizeConfig(given_classes=False))

@@ -12,14 +12,16 @@ from scipy import ndimage
 from toy_published import tiny_model
 
 from mudg.base.types import Photo
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.clips.condition import ConditionRules, build_conditions
-from mudg.data.cloudfile import read_fused
-from mudg.data.scene import read_scene
-from mudg.models.diffusion import SampleRequest
-from mudg.models.published.model import PublishedLatents
-from mudg.stages.config import FuseConfig, IngestConfig
+from mudg.diffusion.clips.condition import ConditionRules, build_conditions
+from mudg.diffusion.published.model import PublishedLatents
+from mudg.diffusion.requests import SampleRequest
+from mudg.formats.settings import IngestConfig
+from mudg.scene.clouds import read_fused
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 

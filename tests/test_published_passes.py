@@ -10,14 +10,14 @@ from test_published import some_condition
 from toy_published import tiny_model
 
 from mudg.base.errors import UsageError
-from mudg.models.diffusion import SampleRequest
-from mudg.models.published.clip import ImageTower
-from mudg.models.published.kl_vae import Decoder, Encoder
-from mudg.models.published.model import PublishedConfig, PublishedMDM, WorkSplit
-from mudg.models.published.resampler import Resampler
-from mudg.models.published.video_unet import Attention, VideoUNet
-from mudg.stages.config import SynthesizeConfig
-from mudg.stages.learning import loading, memory_plan
+from mudg.diffusion import views as loading
+from mudg.diffusion.published.kl_vae import Decoder, Encoder
+from mudg.diffusion.published.model import PublishedConfig, PublishedMDM, WorkSplit
+from mudg.diffusion.published.video_unet import Attention, Resampler, VideoUNet
+from mudg.diffusion.requests import SampleRequest
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.training import memory_plan
+from mudg.networks.clip import ImageTower
 
 
 @pytest.fixture(scope="module")

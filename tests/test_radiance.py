@@ -15,21 +15,20 @@ from toy_world import fused_cloud, view_at, write_scene
 from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, NumericsError, UsageError
-from mudg.data.cloudfile import write_fused
-from mudg.data.observations import read_observations
-from mudg.data.scene import read_scene
-from mudg.fitted import FittedScene
-from mudg.models.radiance import field as fields
-from mudg.models.radiance import march as marching
-from mudg.models.radiance import sampling
-from mudg.models.radiance.field import Extent, FieldSizes, RadianceField, aggregated
-from mudg.models.radiance.march import Budget, RayDraws, Rays
-from mudg.stages.config import FitConfig, RenderConfig, SynthesizeConfig
-from mudg.stages.radiance import loop
-from mudg.stages.radiance.pictures import flow_colors
-from mudg.stages.radiance.rays import extent_of, lidar_rays, view_rays
-from mudg.stages.radiance.storage import load_field
+from mudg.baselines.emernerf import field as fields
+from mudg.baselines.emernerf import field as marching
+from mudg.baselines.emernerf import field as sampling
+from mudg.baselines.emernerf import fit as loop
+from mudg.baselines.emernerf.field import Budget, Extent, FieldSizes, RadianceField, RayDraws, Rays, aggregated
+from mudg.baselines.emernerf.fit import extent_of, flow_colors, lidar_rays, load_field, view_rays
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.editing.view_settings import RenderConfig
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.clouds import write_fused
+from mudg.scene.observations import read_observations
+from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
+from mudg.steps.fitted import FittedScene
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 

@@ -16,7 +16,8 @@ from mudg import native
 from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Gaussians, Render, View
-from mudg.core.raster import gsplat_cuda, gsplat_package, torch_twin
+from mudg.core.raster import gsplat_cuda, torch_twin
+from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import BACKENDS, RasterConfig, rasterize
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from mudg.models.mdm import network
-from mudg.models.mdm.codec import CodecConfig, PatchCodec
-from mudg.models.mdm.network import ConditionPixels, Refiner
+from mudg.diffusion import network
+from mudg.diffusion.network import ConditionPixels, Refiner
+from mudg.networks.codec import CodecConfig, PatchCodec
 
 
 def some(count=4, height=16, width=24, seed=0):

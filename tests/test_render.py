@@ -16,11 +16,12 @@ from mudg.base import geometry, store
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.cloudfile import write_fused
-from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
-from mudg.data.scene import read_scene
-from mudg.stages import fit, render
-from mudg.stages.config import RenderConfig
+from mudg.editing import render
+from mudg.editing.view_settings import RenderConfig
+from mudg.gaussians import fit
+from mudg.scene.clouds import write_fused
+from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
 

@@ -13,17 +13,16 @@ from toy_clips import made_up_clip, with_patch
 from mudg import native
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
-from mudg.base.renders import RenderPlanes
-from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, Track
-from mudg.data.clips import condition as clips
-from mudg.data.clips import from_city
-from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.condition import build_conditions
-from mudg.data.clips.from_city import CityClipRules
-from mudg.models.diffusion import SampleRequest
-from mudg.models.mdm import files, stacked
-from mudg.models.mdm import model as mdm
-from mudg.models.mdm.extended import extended
+from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, RenderPlanes, Track
+from mudg.diffusion import files, stacked
+from mudg.diffusion import model as mdm
+from mudg.diffusion.clips import condition as clips
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.condition import build_conditions
+from mudg.diffusion.clips.from_city import CityClipRules
+from mudg.diffusion.extended import extended
+from mudg.diffusion.requests import SampleRequest
 
 NOTHING = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
 WITH_RENDERS = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))

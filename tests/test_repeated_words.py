@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from mudg.data.scene.check import Finding, folded
-from mudg.pages import score_tables
+from mudg.scene.check import Finding, folded
+from mudg.scoring import tables as score_tables
 
 
 def test_warnings_of_a_kind_are_one_line_with_three_examples() -> None:

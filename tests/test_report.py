@@ -21,15 +21,15 @@ import toy_views
 from jinja2 import UndefinedError
 
 from mudg import app
+from mudg.base import html as report_html
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
-from mudg.data.edits import read_edits
-from mudg.pages import html as report_html
-from mudg.pages import page as report_page
-from mudg.pages import run_report
-from mudg.stages.config import ScoreConfig
+from mudg.editing.script import read_edits
+from mudg.editing.view_settings import ScoreConfig
 from mudg.steps.score import Score
+from mudg.viewer import report as report_page
+from mudg.viewer import report as run_report
 
 
 def dark(share: float) -> Any:

@@ -25,9 +25,9 @@ from mudg.base import store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, take_lock
 from mudg.core.table import Table
-from mudg.stages.config import PageConfig
-from mudg.stages.fitting.storage import save_model
-from mudg.stages.viewing import view
+from mudg.gaussians.storage import save_model
+from mudg.viewer import view
+from mudg.viewer.settings import PageConfig
 
 
 @pytest.fixture(scope="module")

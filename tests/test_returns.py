@@ -19,9 +19,10 @@ from pandas_pickles import write_frame
 
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints
-from mudg.data.importers.pandaset.pandas_frame import read_frame
-from mudg.data.scene import check_scene, read_points
-from mudg.data.scene.returns import at_sensor
+from mudg.formats.importers.pandaset import read_frame
+from mudg.scene.check import check_scene
+from mudg.scene.clouds import at_sensor
+from mudg.scene.read import read_points
 
 pytestmark = roundtrip.needs_native
 MARKS = 64
@@ -179,7 +180,7 @@ def test_zeros_that_a_format_moved_lie_at_the_sensor_when_they_were_measured(tmp
 
 def test_doctor_finds_points_at_the_sensor_and_at_one_largest_range(tmp_path: Path) -> None:
     scene = roundtrip.small_log(tmp_path / "scene")
-    from mudg.data.scene.check import check_points
+    from mudg.scene.check import check_points
 
     sweep: Sweep = scene.sweeps[0]
     points = read_points(scene, sweep)
@@ -218,7 +219,7 @@ def test_zeros_of_merged_lidars_lie_at_their_mounts(tmp_path: Path, tmp_path_fac
 
 def test_bytes_of_an_archive_are_numbers(tmp_path: Path) -> None:
     """An archive of the neutral layout whose coordinates are whole numbers has no-return rows, too."""
-    from mudg.data.importers.clouds import read_cloud
+    from mudg.formats.importers.clouds import read_cloud
 
     buffer = io.BytesIO()
     np.savez(buffer, xyz=np.array([[0, 0, 0], [1, 2, 3]], np.int32))

@@ -13,18 +13,16 @@ import pytest
 
 from mudg import app
 from mudg.base import config as configuration
-from mudg.base import (
-    log,
-    store,
-    usage,
-)
+from mudg.base import log, store
+from mudg.base import memory as usage
 from mudg.base.errors import InputError, IntegrityError, NumericsError, ResourceError, UsageError
-from mudg.pages import run_report
-from mudg.stages import score
-from mudg.stages.config import RunConfig, run_preset, with_seed
+from mudg.scoring import score
 from mudg.steps import pipeline
 from mudg.steps.run import Demo, Run
+from mudg.steps.settings.presets import run_preset
+from mudg.steps.settings.run import RunConfig, with_seed
 from mudg.steps.step import Step
+from mudg.viewer import report as run_report
 
 
 @pytest.fixture

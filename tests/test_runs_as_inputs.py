@@ -19,8 +19,8 @@ from mudg import FittedScene, app, steps
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.benchmarks import run as bench
-from mudg.data.importers import FORMATS
-from mudg.stages import score
+from mudg.formats.importers import FORMATS
+from mudg.scoring import score
 from mudg.steps.engine import Result, paths_of
 
 

@@ -15,10 +15,10 @@ from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
-from mudg.data.clips.sources import FolderOfShards, ShardCache, StreamedShards
-from mudg.stages import learn
-from mudg.stages.learning import clips as learn_clips
-from mudg.stages.learning.scene_list import ListedScene, ListedShards, SceneList, is_list, read_list
+from mudg.diffusion import learn
+from mudg.diffusion.clips.sources import FolderOfShards, ShardCache, StreamedShards
+from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion.training.scene_list import ListedScene, ListedShards, SceneList, is_list, read_list
 from mudg.steps.learn import Learn
 
 
@@ -231,8 +231,8 @@ def test_reading_ahead_brings_what_will_be_drawn(address, tmp_path):
 
 def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
     """Made once; how many clips there are is not counted again."""
-    from mudg.data.clips import from_log
-    from mudg.stages.learning import scene_list
+    from mudg.diffusion.clips import from_log
+    from mudg.diffusion.training import scene_list
 
     calls = collections.Counter()
     windows = [from_log.LogWindow("front", ("a",), False)] * 3

@@ -17,15 +17,16 @@ from mudg.base.errors import InputError, NumericsError
 from mudg.base.types import FusedCloud, PointCloud, Scene, Track
 from mudg.core import metrics, trajectory
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.data.cloudfile import write_fused
-from mudg.data.observations import ObservationWriter
-from mudg.data.scene import SceneWriter, read_scene
-from mudg.models.scene.model import compose
-from mudg.models.scene.nodes import DeformableNode
-from mudg.stages import fit
-from mudg.stages.config import FitConfig
-from mudg.stages.fitting import views as fit_views
-from mudg.stages.fitting.start import mirrored_points
+from mudg.gaussians import fit
+from mudg.gaussians import views as fit_views
+from mudg.gaussians.model import compose
+from mudg.gaussians.nodes import DeformableNode
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.start import mirrored_points
+from mudg.scene.clouds import write_fused
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_scene
+from mudg.scene.write import SceneWriter
 from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6

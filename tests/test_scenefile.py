@@ -20,18 +20,12 @@ from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, MudgError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
-from mudg.data.scene import (
-    SceneWriter,
-    check_scene,
-    read_image,
-    read_label,
-    read_points,
-    read_scene,
-    read_trusted_classes,
-    write_zip,
-)
-from mudg.data.scene.files import open_files
-from mudg.data.scene.schema import ref_problem, scene_to_json_text
+from mudg.scene.check import check_scene
+from mudg.scene.files import open_files
+from mudg.scene.labels import read_label, read_trusted_classes
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.schema import ref_problem, scene_to_json_text
+from mudg.scene.write import SceneWriter, write_zip
 
 CAMERA = Camera("front", 32, 20, 30.0, 31.0, 16.0, 10.0, (0.1, -0.02), 0.005)
 

@@ -15,10 +15,10 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.pictures import resize_nearest
-from mudg.models import featnets
-from mudg.pages import score_tables
-from mudg.stages import score
-from mudg.stages.config import ScoreConfig
+from mudg.editing.view_settings import ScoreConfig
+from mudg.networks import featnets
+from mudg.scoring import score
+from mudg.scoring import tables as score_tables
 from mudg.steps.score import Score
 
 PLAIN = ScoreConfig(perceptual_views=0)

@@ -15,14 +15,16 @@ from torch.nn import functional
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, View
-from mudg.core import metrics, perceptual
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
+from mudg.core import losses as perceptual
+from mudg.core import metrics
 from mudg.core.metrics import Pair
-from mudg.data.city import CityConfig, CityWorld
-from mudg.models.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
-from mudg.models.mdm import files
-from mudg.pages import score_tables
-from mudg.stages import score
-from mudg.stages.config import ScoreConfig
+from mudg.diffusion import files
+from mudg.editing.view_settings import ScoreConfig
+from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
+from mudg.scoring import score
+from mudg.scoring import tables as score_tables
 from mudg.steps.score import Score
 
 

@@ -21,9 +21,9 @@ from tiny_networks import eomt, mask2former, segformer
 
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, ID, UNLABELLED
-from mudg.models import folders
-from mudg.models.labels import segmenters
-from mudg.models.labels.segmenters import KINDS, Segmenter, match_classes, tile_starts
+from mudg.labels import segmenters
+from mudg.labels.segmenters import KINDS, Segmenter, match_classes, tile_starts
+from mudg.networks import folders
 
 NAMES = {"0": "Road", "1": "traffic light", "2": "sky", "3": "unicorn"}
 SQUARE_PX = 64

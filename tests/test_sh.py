@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mudg.base.geometry import matrix_from_quaternion
-from mudg.core import sh as harmonics
+from mudg.core import harmonics
 from mudg.core.raster.torch_twin import sh_basis
 
 

@@ -18,8 +18,8 @@ import toy_splats
 from PIL import Image
 
 from mudg.base.errors import InputError, ResourceError
-from mudg.data.splats import binary, bundle, compressed_ply, formats, gltf, ply, sog, splat, spz, usd
-from mudg.data.splats.cloud import SplatCloud, SplatScene, joined
+from mudg.formats.splats import binary, bundle, compressed_ply, formats, gltf, ply, sog, splat, spz, usd
+from mudg.formats.splats.cloud import SplatCloud, SplatScene, joined
 
 GOLDEN = Path(__file__).parent / "golden" / "splats.json"
 READERS: dict[str, Callable[[bytes], list[slow.Splat]]] = {
@@ -158,7 +158,7 @@ def test_a_turned_cloud_looks_as_from_the_other_side() -> None:
     moved = cloud.moved(pose)
     d = toy_splats.np.random.default_rng(0).normal(size=(9, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    from mudg.core.sh import basis
+    from mudg.core.harmonics import basis
 
     before, after = (
         np.einsum("dk,nkc->dnc", basis(rays, 3), sh) for rays, sh in ((d, cloud.sh), (d @ pose[:3, :3].T, moved.sh))

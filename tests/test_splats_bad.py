@@ -16,8 +16,8 @@ import pytest
 import toy_splats
 
 from mudg.base.errors import InputError, MudgError
-from mudg.data.splats import binary, formats, gltf, ply, sog, splat, spz
-from mudg.data.splats.cloud import SplatCloud
+from mudg.formats.splats import binary, formats, gltf, ply, sog, splat, spz
+from mudg.formats.splats.cloud import SplatCloud
 
 READ = [name for name, one in formats.FORMATS.items() if one.read]
 NOT_STATED = {"splat": 32}

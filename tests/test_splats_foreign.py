@@ -21,11 +21,11 @@ from foreign_splats import C1, F_REST, ROWS, rows
 
 from mudg import app
 from mudg.base.errors import InputError
-from mudg.data.splats import formats
-from mudg.data.splats.cloud import SplatCloud
-from mudg.stages.editing.assets import read_asset
-from mudg.stages.fitting.rendering import raster_of
-from mudg.stages.fitting.storage import load_model
+from mudg.editing.assets import read_asset
+from mudg.formats.splats import formats
+from mudg.formats.splats.cloud import SplatCloud
+from mudg.gaussians.rendering import raster_of
+from mudg.gaussians.storage import load_model
 
 UNIT = {"F": (1, 0, 0), "B": (-1, 0, 0), "L": (0, 1, 0), "R": (0, -1, 0), "U": (0, 0, 1), "D": (0, 0, -1)}
 """The world: x forward, y left, z up."""

@@ -16,9 +16,9 @@ from PIL import Image
 from toy_scene import ToyStreet
 
 from mudg.base import geometry
-from mudg.data.splats import gltf, usd
-from mudg.data.splats.cloud import SplatCloud, SplatScene
-from mudg.data.splats.formats import file_from_world
+from mudg.formats.splats import gltf, usd
+from mudg.formats.splats.cloud import SplatCloud, SplatScene
+from mudg.formats.splats.formats import file_from_world
 
 PREFIX = "KHR_gaussian_splatting:"
 

@@ -26,7 +26,7 @@ from mudg import app
 from mudg.base import location, store
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
-from mudg.stages.batches.records import BatchFolder
+from mudg.fleet.records import BatchFolder
 
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # warnings of the servers' own packages
 
@@ -395,7 +395,7 @@ def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> Non
 
     # threads of one process take each other for dead; as other machines do, they must not
     with pytest.MonkeyPatch.context() as patch, concurrent.futures.ThreadPoolExecutor(6) as pool:
-        patch.setattr("mudg.stages.batches.records.this_host", lambda: f"host {threading.get_ident()}")
+        patch.setattr("mudg.fleet.records.this_host", lambda: f"host {threading.get_ident()}")
         answers = list(pool.map(race, range(6)))
     if CONDITIONAL[server]:
         assert answers.count("mine") <= 1 and most[0] <= 1

@@ -17,15 +17,14 @@ from toy_scene import ToyStreet
 from mudg.base import checkpoint, geometry
 from mudg.base.errors import InputError, IntegrityError, ResourceError
 from mudg.base.palette import CLASSES, ID
-from mudg.core.complete import ray_elevation
-from mudg.core.visible import RULES as HIDING_RULES
-from mudg.core.visible import visible_depth
-from mudg.models.labels import street_net
-from mudg.models.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
-from mudg.models.labels.inputs import TRAIN_ID_OF
-from mudg.models.labels.labellers import labeller
-from mudg.models.labels.street_labels import at_size, reduced, settled, settled_by_color
-from mudg.models.labels.street_net import StreetNet, StreetNetConfig
+from mudg.core.depth import ray_elevation
+from mudg.core.project import RULES as HIDING_RULES
+from mudg.core.project import visible_depth
+from mudg.labels import street_net
+from mudg.labels.evidence import BOX_GROUPS, PLANE_COUNT, PLANES, Evidence, encode, gather
+from mudg.labels.inputs import TRAIN_ID_OF
+from mudg.labels.labellers import labeller
+from mudg.labels.street_net import StreetNet, StreetNetConfig, at_size, reduced, settled, settled_by_color
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))

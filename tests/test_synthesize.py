@@ -13,18 +13,19 @@ from mudg.base import palette, scratch
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
 from mudg.core import trajectory
-from mudg.data.clips import condition, stacked
-from mudg.data.observations import list_observation_sets, read_observations
-from mudg.data.scene import read_scene
-from mudg.models.mdm import files
-from mudg.models.mdm.codec import CodecConfig
-from mudg.models.mdm.extended import extended
-from mudg.models.mdm.model import MDM, MDMConfig
-from mudg.stages import fit, synthesize
-from mudg.stages.config import FuseConfig, SynthesizeConfig
-from mudg.stages.fitting.planes import FAR_M, render_planes
-from mudg.stages.fitting.rendering import render_condition
-from mudg.stages.learning.views import PreparedImages, ViewMaker, add_detail, windows
+from mudg.diffusion import files
+from mudg.diffusion.clips import condition, stacked
+from mudg.diffusion.extended import extended
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.views import PreparedImages, ViewMaker, add_detail, windows
+from mudg.gaussians import fit
+from mudg.gaussians.rendering import FAR_M, render_condition, render_planes
+from mudg.networks.codec import CodecConfig
+from mudg.scene.observations import list_observation_sets, read_observations
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
+from mudg.steps import synthesis as synthesize
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize

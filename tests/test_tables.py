@@ -5,18 +5,8 @@ import io
 
 import pytest
 
-from mudg.pages import html
-from mudg.pages.tables import (
-    PUBLISHED,
-    TextCell,
-    TextLine,
-    TextTable,
-    best_of,
-    csv_text,
-    latex,
-    markdown,
-    markdown_table,
-)
+from mudg.base import html
+from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown, markdown_table
 
 TABLE = TextTable(
     ("", "FID ↓", "a_b"),

@@ -20,30 +20,30 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
+from mudg.baselines import pvg
+from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
+from mudg.baselines.emernerf import fit as radiance_loop
+from mudg.baselines.emernerf import fit as rays
+from mudg.baselines.flat_network import FlatNetwork, waves
+from mudg.baselines.omnire import DeformationField, DeformedNode
+from mudg.baselines.pvg import VibrationNode, average_velocity, moving_rows, starting_columns
+from mudg.baselines.s3gaussian import SHORT_GAIN, HexPlaneNode, plane_smoothness
+from mudg.baselines.s3gaussian import moving_rows as hexplane_moving
 from mudg.core import losses, metrics
-from mudg.core.hex_planes import PlaneSizes
+from mudg.core.grids import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.data.cloudfile import read_fused, write_fused
-from mudg.data.scene import read_scene
-from mudg.methods import METHODS, PUBLISHED
-from mudg.models.scene import densify, nodes
-from mudg.models.scene.bezier import BezierNode, bernstein, distance_change, fit_path
-from mudg.models.scene.deformed import DeformationField, DeformedNode
-from mudg.models.scene.flat_network import FlatNetwork, waves
-from mudg.models.scene.hexplane import SHORT_GAIN, HexPlaneNode, plane_smoothness
-from mudg.models.scene.hexplane import moving_rows as hexplane_moving
-from mudg.models.scene.initial import columns_from_points
-from mudg.models.scene.model import SceneModel, compose
-from mudg.models.scene.nodes import NodeRows, RigidNode, StaticNode
-from mudg.models.scene.vibration import VibrationNode, average_velocity, moving_rows, starting_columns
-from mudg.stages import fit, fuse
-from mudg.stages.config import FuseConfig
-from mudg.stages.fitting import pvg
-from mudg.stages.fitting import views as fit_views
-from mudg.stages.fitting.recipes import RECIPES, recipe_of
-from mudg.stages.radiance import loop as radiance_loop
-from mudg.stages.radiance import rays
+from mudg.gaussians import densify, fit, nodes
+from mudg.gaussians import views as fit_views
+from mudg.gaussians.methods import METHODS, PUBLISHED
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
+from mudg.gaussians.recipes import RECIPES, recipe_of
+from mudg.gaussians.start import columns_from_points
+from mudg.scene import fuse
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 

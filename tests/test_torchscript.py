@@ -12,9 +12,8 @@ import torch
 from test_i3d import made_up, renamed
 
 from mudg.base.errors import InputError
-from mudg.data.torchscript import is_torchscript, read_torchscript
-from mudg.data.weights import read_checkpoint
-from mudg.models import i3d
+from mudg.base.weights import is_torchscript, read_checkpoint, read_torchscript
+from mudg.networks import i3d
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")
 

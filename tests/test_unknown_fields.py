@@ -26,10 +26,10 @@ from roundtrip import needs_native
 
 from mudg.base import log
 from mudg.base.errors import InputError
-from mudg.data import unknown_fields
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.clouds import read_cloud
-from mudg.data.importers.options import ImportOptions
+from mudg.formats import unknown_fields
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.clouds import read_cloud
+from mudg.formats.importers.common import ImportOptions
 
 Adder = Callable[[Path, Sequence[str]], object]
 pytestmark = needs_native
@@ -257,11 +257,10 @@ def test_real_logs_hold_no_unknown_field(
 def test_parts_of_real_logs_hold_no_unknown_field(shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture[str]) -> None:
     """Files of logs that lack what a scene needs: both tables of calibration, boxes, poses and sweeps; frames; calibration text."""
     pytest.importorskip("pyarrow")
-    from mudg.data.importers import argoverse2
-    from mudg.data.importers.kitti.boxes import read_label_text
-    from mudg.data.importers.kitti.calib import read_calibration_text
-    from mudg.data.importers.waymo.parquet import OFFICIAL, ParquetTable
-    from mudg.data.importers.waymo.tfrecord import TfrecordLog
+    from mudg.formats.importers import argoverse2
+    from mudg.formats.importers.kitti.files import read_calibration_text, read_label_text
+    from mudg.formats.importers.waymo.parquet import OFFICIAL, ParquetTable
+    from mudg.formats.importers.waymo.tfrecord import TfrecordLog
 
     av2, waymo, tracking = (shared_data(name) for name in ("av2_two_sweeps", "waymo_frame", "kitti_tracking_0001"))
     with unknown_fields.named_once():

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mudg.base import store, usage
+from mudg.base import memory as usage
+from mudg.base import store
+from mudg.base.memory import Meter, Usage
 from mudg.base.run_folder import RunDir, VerbOutput
-from mudg.base.usage import Meter, Usage
 
 OUTPUT = VerbOutput("work", 1, ("*.txt",))
 needs_proc = pytest.mark.skipif(usage.held_bytes() is None, reason="the system does not tell the memory of processes (/proc)")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mudg.base.errors import UsageError
-from mudg.models.mdm.codec import CodecConfig, PatchCodec, code_to_depth, depth_to_code, semantic_shares
+from mudg.networks.codec import CodecConfig, PatchCodec, code_to_depth, depth_to_code, semantic_shares
 
 
 def smooth_images(count=6, height=16, width=24, seed=0):

@@ -10,7 +10,7 @@ import pytest
 
 from mudg.base.errors import InputError
 from mudg.core.pictures import side_by_side
-from mudg.data.exporters import video
+from mudg.formats.exporters import video
 
 
 def clip(count: int = 5, height: int = 32, width: int = 48) -> list[np.ndarray]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from mudg import app
 from mudg.base import failures
 from mudg.base.errors import ResourceError
-from mudg.data.exporters.video import write_mp4
+from mudg.formats.exporters.video import write_mp4
 resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
 rng = np.random.default_rng(0)
 try:

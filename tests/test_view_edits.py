@@ -20,27 +20,27 @@ from toy_fitted import STREET, write_toy_run
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.core.ground import HeightMap
+from mudg.core.edit import HeightMap
 from mudg.core.trajectory import at_shift
-from mudg.data.edits import parse_edits, read_edits
-from mudg.data.observations import read_observations
-from mudg.data.scene import read_scene
-from mudg.models.scene.edited import motion_of
-from mudg.models.scene.model import SceneModel
-from mudg.pages.viewer.facts import UNKNOWN, PageFacts, with_ground
-from mudg.stages.config import EditConfig, RenderConfig
-from mudg.stages.config.view import PageConfig
-from mudg.stages.editing.apply import street_left
-from mudg.stages.editing.carried import carry_out
-from mudg.stages.editing.plan import EditPlan
-from mudg.stages.editing.weathered import conditions_of, in_weather, weather_of
-from mudg.stages.fitting.rendering import raster_of, render_view
-from mudg.stages.viewing import edits as desk_module
-from mudg.stages.viewing import view
-from mudg.stages.viewing.edits import MARK, EditDesk, EditFiles, EditRequest, desk_for, place_for
-from mudg.stages.viewing.frames import FrameRequest, FrameSource
+from mudg.editing.apply import street_left
+from mudg.editing.carried import carry_out
+from mudg.editing.model import motion_of
+from mudg.editing.plan import EditPlan
+from mudg.editing.script import parse_edits, read_edits
+from mudg.editing.settings import EditConfig
+from mudg.editing.view_settings import RenderConfig
+from mudg.editing.weathered import conditions_of, in_weather, weather_of
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.scene.observations import read_observations
+from mudg.scene.read import read_scene
 from mudg.steps.edit import Edit
 from mudg.steps.render import RenderViews
+from mudg.viewer import live as desk_module
+from mudg.viewer import view
+from mudg.viewer.live import MARK, EditDesk, EditFiles, EditRequest, FrameRequest, FrameSource, desk_for, place_for
+from mudg.viewer.page import UNKNOWN, PageFacts, with_ground
+from mudg.viewer.settings import PageConfig
 
 Toy = tuple[Path, Path, SceneModel]
 SCRIPT = "- move: {id: car-1, along_m: 1.5, left_m: 1, yaw_deg: 20}\n"
@@ -274,7 +274,7 @@ def test_the_page_moves_objects_as_the_program_does(
     opened: Browser, toy: Toy, script: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, scene = toy[2], read_scene(toy[0] / "scene")
-    monkeypatch.setattr("mudg.stages.editing.carried.ground_of", lambda cloud, model: hilly())
+    monkeypatch.setattr("mudg.editing.carried.ground_of", lambda cloud, model: hilly())
     drive = carry_out(parse_edits(script, "edits.yaml"), model)
     edited = drive.model(model)
     entries = [
@@ -358,7 +358,7 @@ def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, 
 def test_a_page_with_a_server_checks_and_saves(toy: Toy, tmp_path: Path) -> None:
     import threading
 
-    from mudg.stages.config.view import ViewConfig
+    from mudg.viewer.settings import ViewConfig
 
     if CHROMIUM is None:
         pytest.skip(NO_BROWSER)

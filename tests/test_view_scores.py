@@ -14,16 +14,18 @@ import toy_world
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, Scene, Track, View
-from mudg.core import flicker, trajectory, view_metrics
-from mudg.core.box_scores import nta_truths
-from mudg.core.metrics import Pair
-from mudg.core.view_facts import ViewFacts
-from mudg.data.city import CityConfig, CityWorld, write_city
-from mudg.data.observations import ObservationWriter
-from mudg.data.scene import read_scene
-from mudg.pages import score_tables
-from mudg.stages.config import ScoreConfig
-from mudg.stages.scoring import detections
+from mudg.city.config import CityConfig
+from mudg.city.logs import write_city
+from mudg.city.world import CityWorld
+from mudg.core import metrics as flicker
+from mudg.core import trajectory, view_metrics
+from mudg.core.metrics import Pair, ViewFacts
+from mudg.core.street_scores import nta_truths
+from mudg.editing.view_settings import ScoreConfig
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_scene
+from mudg.scoring import detections
+from mudg.scoring import tables as score_tables
 from mudg.steps.score import DrawTruth, Score
 
 QUICK = ScoreConfig(perceptual_views=0, error_pictures=False)

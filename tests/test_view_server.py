@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from mudg.base.errors import ResourceError
-from mudg.stages.viewing import server as served
-from mudg.stages.viewing.server import Site, SiteServer, open_server
+from mudg.viewer import server as served
+from mudg.viewer.server import Site, SiteServer, open_server
 
 TOKEN = "a-secret-of-the-test"
 PAGE = b"<html>" + b"x" * 5_000_000

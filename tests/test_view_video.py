@@ -23,11 +23,11 @@ from view_server import ask, begin, serving
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.types import View
 from mudg.core.trajectory import at_shift
-from mudg.data.scene import read_scene
-from mudg.models.scene.model import SceneModel
-from mudg.stages.fitting.rendering import raster_of, render_view
-from mudg.stages.viewing import frames
-from mudg.stages.viewing.frames import FrameSource, VideoRequest
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.scene.read import read_scene
+from mudg.viewer import live as frames
+from mudg.viewer.live import FrameSource, VideoRequest
 
 Toy = tuple[Path, Path, SceneModel]
 

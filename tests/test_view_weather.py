@@ -15,13 +15,13 @@ from toy_fitted import STREET, write_toy_run
 
 from mudg.base import seeds
 from mudg.base.types import View
-from mudg.core.weather import particles
-from mudg.data.edits import read_edits
-from mudg.models.scene.model import SceneModel
-from mudg.stages.config.view import PageConfig
-from mudg.stages.editing.weathered import SEED
-from mudg.stages.fitting.rendering import raster_of, render_view
-from mudg.stages.viewing import view
+from mudg.core.weather import air as particles
+from mudg.editing.script import read_edits
+from mudg.editing.weathered import SEED
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.viewer import view
+from mudg.viewer.settings import PageConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
 RAIN, SNOW = 25, 2

@@ -27,14 +27,23 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
-from mudg.models.scene.model import SceneModel
-from mudg.pages.viewer import page as viewer_page
-from mudg.pages.viewer.chunks import chunk_rows, coverage, level_of, morton_codes, opacity_of
-from mudg.pages.viewer.packed import BLOCK, blob_of, pack_scene, smallest_three
-from mudg.stages.config.view import PageConfig
-from mudg.stages.fitting.rendering import raster_of, render_view
-from mudg.stages.viewing import view
-from mudg.stages.viewing.server import token_for
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.viewer import page as viewer_page
+from mudg.viewer import view
+from mudg.viewer.page import (
+    BLOCK,
+    blob_of,
+    chunk_rows,
+    coverage,
+    level_of,
+    morton_codes,
+    opacity_of,
+    pack_scene,
+    smallest_three,
+)
+from mudg.viewer.server import token_for
+from mudg.viewer.settings import PageConfig
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 
@@ -263,7 +272,7 @@ def test_a_folder_of_something_else_is_not_replaced(
 
 
 def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, SceneModel]) -> None:
-    from mudg.data.scene import read_scene
+    from mudg.scene.read import read_scene
 
     scene = read_scene(toy[0] / "scene")
     page = view.page_of(PageConfig(images=0, budget=500), view.Shown(scene, (("fit", toy[2]),)))
@@ -277,7 +286,7 @@ def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, S
 def test_a_page_stays_within_the_memory_that_it_may_take(
     toy: tuple[Path, Path, SceneModel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mudg.data.scene import read_scene
+    from mudg.scene.read import read_scene
 
     for degree in range(4):
         for size in (64, 65_536):
@@ -319,7 +328,7 @@ def opened(toy: tuple[Path, Path, SceneModel], tmp_path_factory: pytest.TempPath
 @pytest.mark.slow
 @needs_browser
 def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[Path, Path, SceneModel]) -> None:
-    from mudg.data.scene import read_scene
+    from mudg.scene.read import read_scene
 
     scene, model = read_scene(toy[0] / "scene"), toy[2]
     for time_s, shift_m in ((0.0, 0.0), (0.4, 0.0), (0.4, 2.0), (0.6, -2.0), (0.8, 0.5)):
@@ -415,7 +424,7 @@ def test_hidden_objects_are_gone(opened: Browser, toy: tuple[Path, Path, SceneMo
 @pytest.mark.slow
 @needs_browser
 def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> None:
-    from mudg.data.edits import read_edits
+    from mudg.editing.script import read_edits
 
     module = "import('mudg/share').then((share) => share.editScript({hidden: new Set(['car-1', 'a \"b\"'])}))"
     (tmp_path / "edits.yaml").write_text(opened.run(module), encoding="utf-8")
@@ -426,7 +435,7 @@ def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> No
 @pytest.mark.slow
 @needs_browser
 def test_names_from_a_log_do_not_run(opened: Browser, toy: tuple[Path, Path, SceneModel], tmp_path: Path) -> None:
-    from mudg.data.scene import read_scene
+    from mudg.scene.read import read_scene
 
     name = "</script><script>document.documentElement.dataset.foreign=1</script><img src=x onerror='document.title=1'>"
     scene = read_scene(toy[0] / "scene")
@@ -605,7 +614,7 @@ def test_other_machines_need_a_token() -> None:
 
 
 def test_fits_of_different_logs_are_not_compared(toy: tuple[Path, Path, SceneModel], tmp_path: Path) -> None:
-    from mudg.stages.fitting.storage import save_model
+    from mudg.gaussians.storage import save_model
 
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")
     with pytest.raises(InputError, match="another"):

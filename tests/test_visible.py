@@ -10,9 +10,10 @@ import pytest
 from mudg.base.errors import InputError
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, unproject
 from mudg.base.types import Camera, View
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
 from mudg.core.fusion import largest_beam_gap
-from mudg.core.visible import RULES, HidingRule, hidden_pixels, nearer_depth, visible_depth
-from mudg.data.city import CityConfig, CityWorld
+from mudg.core.project import RULES, HidingRule, hidden_pixels, nearer_depth, visible_depth
 
 CAMERA = Camera("front", 60, 40, 50.0, 50.0, 30.0, 20.0)
 WIDE = Camera("front", 90, 60, 80.0, 80.0, 45.0, 30.0)

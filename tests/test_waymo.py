@@ -18,12 +18,14 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
-from mudg.data.city import rig
-from mudg.data.importers.waymo import messages, sensors, tfrecord, tracks
-from mudg.data.importers.waymo.parquet import ParquetTable
-from mudg.data.importers.waymo.records import WaymoBox
-from mudg.data.importers.waymo.tfrecord import TfrecordLog
-from mudg.data.scene import read_image, read_label, read_points
+from mudg.city import sensors as rig
+from mudg.formats.importers.waymo import messages, sensors, tfrecord
+from mudg.formats.importers.waymo import records as tracks
+from mudg.formats.importers.waymo.parquet import ParquetTable
+from mudg.formats.importers.waymo.records import WaymoBox
+from mudg.formats.importers.waymo.tfrecord import TfrecordLog
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points
 
 # --- round trips ------------------------------------------------------------------------------------------------------
 

@@ -16,11 +16,11 @@ import write_waymo as made
 from waymo_logs import ingest, write
 
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.data.importers import RECOGNISERS
-from mudg.data.importers.waymo import records as waymo_log
-from mudg.data.importers.waymo import tfrecord as waymo_tfrecord
-from mudg.data.importers.waymo.parquet import ParquetTable
-from mudg.data.scene import read_points
+from mudg.formats.importers import RECOGNISERS
+from mudg.formats.importers.waymo import records as waymo_log
+from mudg.formats.importers.waymo import tfrecord as waymo_tfrecord
+from mudg.formats.importers.waymo.parquet import ParquetTable
+from mudg.scene.read import read_points
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, yaw_matrix
-from mudg.data.importers.waymo import messages, sensors, tfrecord
-from mudg.data.importers.waymo import tracks as waymo_tracks
-from mudg.data.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
+from mudg.formats.importers.waymo import messages, sensors, tfrecord
+from mudg.formats.importers.waymo import records as waymo_tracks
+from mudg.formats.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
 
 
 def rng(seed: int = 0) -> np.random.Generator:

@@ -21,7 +21,10 @@ from mudg.base.weather_settings import (
     WeatherSettings,
 )
 from mudg.core import weather
-from mudg.core.weather import fog, ground, noise, relight, tone
+from mudg.core.weather import air as fog
+from mudg.core.weather import ground, noise
+from mudg.core.weather import light as relight
+from mudg.core.weather import light as tone
 from mudg.core.weather.gbuffer import (
     GBuffer,
     OccluderMap,

@@ -11,7 +11,8 @@ import pytest
 from mudg.base import geometry
 from mudg.base.types import Camera, SweepPoints, View
 from mudg.base.weather_settings import FogSettings, RainSettings, WeatherSettings
-from mudg.core.weather import lidar, particles
+from mudg.core.weather import air as particles
+from mudg.core.weather import lidar
 
 
 def view_at(x: float = 0.0, yaw: float = 0.0, time_s: float = 0.0, size: tuple[int, int] = (60, 40)) -> View:

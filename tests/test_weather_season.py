@@ -11,7 +11,8 @@ from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
 from mudg.base.weather_settings import Conditions, SeasonSettings
-from mudg.core.weather import apply, season
+from mudg.core.weather import apply
+from mudg.core.weather import light as season
 from mudg.core.weather.gbuffer import from_render
 
 LOOKING = geometry.from_rotation_translation(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (0, 0, 1.5))

@@ -15,12 +15,12 @@ import torch
 from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_checkpoint
 
 from mudg import app
+from mudg.base import weights
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.data import weights
-from mudg.models.published import files as published_files
-from mudg.models.published.model import PublishedConfig
-from mudg.stages import convert
-from mudg.stages.config import ConvertConfig
+from mudg.diffusion.published import model as published_files
+from mudg.diffusion.published.model import PublishedConfig
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.steps import conversion as convert
 
 CONFIG = ConvertConfig(resolution="320x512")
 ENTER = "model.diffusion_model.input_blocks.0.0.weight"

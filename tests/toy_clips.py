@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from mudg.base.renders import RenderPlanes
-from mudg.base.types import Camera, Clip, Condition, FinePatch, View
-from mudg.data.clips import shards as clip_shards
-from mudg.data.clips.from_city import HELD_OUT
-from mudg.stages.config import LearnConfig
-from mudg.stages.config.learn import LearnCodec
+from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.from_city import HELD_OUT
+from mudg.diffusion.settings.learn import LearnCodec, LearnConfig
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
 

@@ -11,10 +11,10 @@ from toy_scene import CAR_SIZE_M, ToyStreet
 from mudg.base.palette import ID
 from mudg.base.types import Scene
 from mudg.core.table import Table
-from mudg.models.scene.model import SceneModel
-from mudg.models.scene.nodes import DEFORM_CELLS, DeformableNode, RigidNode, StaticNode
-from mudg.models.scene.sky import SkyNode
-from mudg.stages.fitting.storage import save_model
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import DEFORM_CELLS, DeformableNode, RigidNode, StaticNode
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.storage import save_model
 
 CLASSES = (ID["road"], ID["building"], ID["vegetation"], ID["sky"], ID["person"], ID["car"])
 PERSON_M = (0.8, 0.8, 1.8)

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from mudg.models import inception
+from mudg.networks import inception
 
 
 def state(seed: int = 0) -> dict[str, torch.Tensor]:

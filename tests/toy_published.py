@@ -6,15 +6,15 @@ import numpy as np
 import torch
 from toy_clips import with_settings
 
+from mudg.base import weights
 from mudg.core.noise import ScheduleConfig
-from mudg.data import weights
-from mudg.models.published.clip import TowerConfig
-from mudg.models.published.kl_vae import AutoencoderConfig
-from mudg.models.published.model import PublishedConfig, PublishedMDM
-from mudg.models.published.resampler import ResamplerConfig
-from mudg.models.published.video_unet import VideoUNetConfig
-from mudg.stages import convert
-from mudg.stages.config import ConvertConfig, LearnConfig
+from mudg.diffusion.published.kl_vae import AutoencoderConfig
+from mudg.diffusion.published.model import PublishedConfig, PublishedMDM
+from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion.settings.learn import LearnConfig
+from mudg.networks.clip import TowerConfig
+from mudg.steps import conversion as convert
 
 TINY = PublishedConfig(
     net=VideoUNetConfig(

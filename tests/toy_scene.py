@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mudg.base.geometry import CAM_FROM_EGO_AXES, from_rotation_translation, invert, yaw_matrix
 from mudg.base.palette import ID
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
-from mudg.data.scene import SceneWriter
+from mudg.scene.write import SceneWriter
 
 Matrix = NDArray[np.float64]
 GROUND, WALL_LOW, WALL_HIGH, PANEL, CAR, SKY = range(6)

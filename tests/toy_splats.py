@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mudg.base import geometry
-from mudg.data.splats.cloud import SplatCloud, SplatNode, SplatScene
+from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene
 
 
 def cloud(count: int = 3, degree: int = 0, seed: int = 0, classes: bool = False, spread: float = 10.0) -> SplatCloud:

@@ -10,8 +10,9 @@ import torch
 
 from mudg.base.types import Camera, EgoPath, Observation, Source, SweepPoints, View
 from mudg.core import trajectory
-from mudg.data.observations import ObservationWriter
-from mudg.data.scene import SceneWriter, read_scene
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_scene
+from mudg.scene.write import SceneWriter
 
 WIDTH, HEIGHT, FRAMES = 48, 32, 4
 CAMERA = Camera("front", WIDTH, HEIGHT, 40.0, 40.0, WIDTH / 2, HEIGHT / 2)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 
-from mudg.models import clip_image, dinov2
+from mudg.networks import clip_image, dinov2
 
 
 def drawn(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, torch.Tensor]:

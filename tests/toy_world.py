@@ -15,7 +15,7 @@ import torch
 
 from mudg.base import geometry
 from mudg.base.palette import ID
-from mudg.base.types import (
+from mudg.base.types import (  # fmt: skip
     Camera,
     EgoPath,
     FusedCloud,
@@ -26,8 +26,8 @@ from mudg.base.types import (
     SweepPoints,
     Track,
     View,
-)  # fmt: skip
-from mudg.data.scene import SceneWriter
+)
+from mudg.scene.write import SceneWriter
 
 CAR_SIZE = np.array([4.2, 1.8, 1.5])
 CAM_FROM_EGO = geometry.CAM_FROM_EGO_AXES

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mudg.stages.config.view import ViewConfig
-from mudg.stages.viewing import view
-from mudg.stages.viewing.edits import EditFiles
+from mudg.viewer import view
+from mudg.viewer.live import EditFiles
+from mudg.viewer.settings import ViewConfig
 
 
 @contextmanager

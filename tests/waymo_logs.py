@@ -15,10 +15,10 @@ import write_waymo as made
 from mudg.base import geometry
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import Scene, Track
-from mudg.data.city import rig
-from mudg.data.importers import IMPORTERS
-from mudg.data.importers.options import ImportOptions
-from mudg.data.scene import read_scene
+from mudg.city import sensors as rig
+from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers.common import ImportOptions
+from mudg.scene.read import read_scene
 
 COLUMNS = 240
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mudg.base.geometry import invert, quaternion_from_matrix, transform_points, yaw_matrix
 from mudg.base.types import Scene
-from mudg.data.importers.argoverse2 import CAMERAS
-from mudg.data.scene import read_points
-from mudg.data.scene.files import open_files
+from mudg.formats.importers.argoverse2 import CAMERAS
+from mudg.scene.files import open_files
+from mudg.scene.read import read_points
 
 START_NS = 315_966_253_572_412_942
 CITY_FROM_WORLD = yaw_matrix(-0.7, (5172.6, 2419.1, 66.9))

@@ -12,7 +12,7 @@ from PIL import Image
 
 from mudg.base.geometry import invert, quaternion_from_matrix, yaw_of
 from mudg.base.types import Scene, SweepPoints
-from mudg.data.scene import read_image, read_points
+from mudg.scene.read import read_image, read_points
 
 START_NS = 1_700_000_000_123_456_789
 EAST_M = np.array([512_345.5, 5_403_210.25, 310.0])

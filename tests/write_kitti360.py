@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import Scene
-from mudg.data.scene import read_image, read_points
+from mudg.scene.read import read_image, read_points
 
 Matrix = NDArray[np.float64]
 DRIVE = "2013_05_28_drive_0003_sync"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base.geometry import invert, yaw_matrix, yaw_of
 from mudg.base.types import Scene
-from mudg.data.scene import read_image, read_points
+from mudg.scene.read import read_image, read_points
 
 LOG = "2021.05.12.22.00.38_veh-35_01008_01518"
 EPOCH_US = 1_620_857_890_123_456

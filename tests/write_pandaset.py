@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import EgoPath, Scene
-from mudg.data.importers.common import pose_near
-from mudg.data.scene import read_image, read_points
+from mudg.formats.importers.common import pose_near
+from mudg.scene.read import read_image, read_points
 
 EPOCH_S = 1_557_539_924.0
 SOURCE_FROM_WORLD = yaw_matrix(0.8, (12.0, -34.0, 1.5))

@@ -29,14 +29,13 @@ from scipy.spatial import cKDTree
 from mudg.base import geometry
 from mudg.base.geometry import matrix_from_quaternion
 from mudg.base.types import Scene
-from mudg.data.exporters.pictures import picture_names
-from mudg.data.ncore import package
-from mudg.data.scene import read_points, read_scene
-from mudg.data.splats.cloud import SplatCloud
-from mudg.data.splats.formats import FORMATS, read_cloud
-from mudg.stages.config import ExportConfig
-from mudg.stages.exporting.export import CAMERAS
-from mudg.stages.exporting.messages import SUFFIXES
+from mudg.exporting.export import CAMERAS, SUFFIXES
+from mudg.exporting.settings import ExportConfig
+from mudg.formats.exporters.cameras import picture_names
+from mudg.formats.ncore import package
+from mudg.formats.splats.cloud import SplatCloud
+from mudg.formats.splats.formats import FORMATS, read_cloud
+from mudg.scene.read import read_points, read_scene
 from mudg.steps.export import Export
 
 SINGLE = ("ply", "spz", "compressed-ply", "sog", "splat")

@@ -58,7 +58,7 @@ def inception() -> None:
     from torch_fidelity.feature_extractor_inceptionv3 import FeatureExtractorInceptionV3
 
     from mudg.core import feature_distances
-    from mudg.models import inception as ours
+    from mudg.networks import inception as ours
 
     state = toy_inception.state()
     network = ours.InceptionFeatures(state)
@@ -93,7 +93,7 @@ def lpips() -> None:
     import lpips as package
 
     from mudg.core.metrics import Pair
-    from mudg.models.featnets import TRUNKS, LpipsFeatures, PerceptualDistance
+    from mudg.networks.featnets import TRUNKS, LpipsFeatures, PerceptualDistance
 
     first, second = (torch.from_numpy(image).permute(2, 0, 1).float() / 255 for image in pictures(2, 96, 120))
     for trunk in TRUNKS:
@@ -109,7 +109,7 @@ def transformers() -> None:
     """DINOv2's blocks at their own size, its positions, and CLIP's tower."""
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection, Dinov2Config, Dinov2Model
 
-    from mudg.models import clip_image, dinov2
+    from mudg.networks import clip_image, dinov2
 
     state = toy_vit.dino_state(width=128, blocks=3)
     config = Dinov2Config(hidden_size=128, num_hidden_layers=3, num_attention_heads=2, image_size=518, patch_size=14)

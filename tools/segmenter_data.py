@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry, seeds, store
 from mudg.base.types import Track, View
+from mudg.city import logs as city_logs
+from mudg.city.config import CityConfig
+from mudg.city.world import CityWorld
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, measure_beam_gap, separate
-from mudg.data.city import CityConfig, CityWorld
-from mudg.data.city import logs as city_logs
-from mudg.models.labels.evidence import Evidence, gather
-from mudg.models.labels.inputs import LabelInput
+from mudg.labels.evidence import Evidence, gather
+from mudg.labels.inputs import LabelInput
 
 FRAMES = 14
 VIEWS = 4

@@ -34,12 +34,11 @@ from mudg import native
 from mudg.base import checkpoint, seeds, store
 from mudg.base.errors import ResourceError
 from mudg.base.palette import CLASSES, UNLABELLED
-from mudg.data.city import logs as city_logs
-from mudg.models.labels import street_net
-from mudg.models.labels.by_geometry import label_by_geometry
-from mudg.models.labels.evidence import encode
-from mudg.models.labels.street_labels import StreetLabeller
-from mudg.models.labels.street_net import StreetNet, StreetNetConfig
+from mudg.city import logs as city_logs
+from mudg.labels import street_net
+from mudg.labels.by_geometry import label_by_geometry
+from mudg.labels.evidence import encode
+from mudg.labels.street_net import StreetLabeller, StreetNet, StreetNetConfig
 
 RECIPE = ("seed", "size", "cities", "first_cities", "all_cities_at", "batch", "lr", "balance")
 AVERAGE = 0.995
@@ -51,7 +50,7 @@ CARD = """# Small segmentation network for streets
 
 Tells the Cityscapes classes of a picture from its colours and from measured evidence at every pixel: height above the
 ground plane, dense depth and how far away it was measured, the surface's direction and roughness, distance to the
-driven path and whether a step lies between, elevation of the ray, and tracked boxes (`models/labels/evidence.py`). Works, with
+driven path and whether a step lies between, elevation of the ray, and tracked boxes (`labels/evidence.py`). Works, with
 less, without LiDAR or boxes.
 {parameters:.2f} million parameters, stored in float16.
 

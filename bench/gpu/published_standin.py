@@ -32,19 +32,18 @@ from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.core.noise import ScheduleConfig
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
-from mudg.data.clips import from_city
-from mudg.data.clips import shards as clip_shards
-from mudg.models.diffusion import GeneratedClip, SampleRequest, generated
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
-from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.codec import MODALITIES
-from mudg.models.published import files as published_files
-from mudg.models.published.clip import TowerConfig
-from mudg.models.published.kl_vae import AutoencoderConfig
-from mudg.models.published.model import GUIDANCE, PublishedConfig, PublishedLatents, PublishedMDM, WorkSplit
-from mudg.models.published.resampler import ResamplerConfig
-from mudg.models.published.video_unet import VideoUNetConfig
-from mudg.stages.learning import score as learn_score
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.published import model as published_files
+from mudg.diffusion.published.kl_vae import AutoencoderConfig
+from mudg.diffusion.published.model import GUIDANCE, PublishedConfig, PublishedLatents, PublishedMDM, WorkSplit
+from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
+from mudg.diffusion.training import score as learn_score
+from mudg.networks.clip import TowerConfig
+from mudg.networks.codec import MODALITIES
+from mudg.networks.featnets import CodecFeatures, PerceptualDistance
 
 RULES = from_city.CityClipRules(width=96, height=64, window=8, clips=4, published=True)
 CONFIG = PublishedConfig(

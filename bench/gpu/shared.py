@@ -18,12 +18,11 @@ from mudg.base import seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.versions import environment
 from mudg.core.noise import ScheduleConfig
-from mudg.models.published.clip import TowerConfig
-from mudg.models.published.kl_vae import AutoencoderConfig
-from mudg.models.published.model import PublishedConfig, PublishedMDM
-from mudg.models.published.resampler import ResamplerConfig
-from mudg.models.published.video_unet import VideoUNetConfig
-from mudg.stages.learning import memory_plan
+from mudg.diffusion.published.kl_vae import AutoencoderConfig
+from mudg.diffusion.published.model import PublishedConfig, PublishedMDM
+from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
+from mudg.diffusion.training import memory_plan
+from mudg.networks.clip import TowerConfig
 
 SMALL_PUBLISHED = PublishedConfig(
     net=VideoUNetConfig(width=32, multipliers=(1, 2), blocks=1, attention=(True, False), head_width=8, first_heads=2, context_width=16),

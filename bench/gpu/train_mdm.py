@@ -18,9 +18,8 @@ from typing import Any
 from shared import device_of, finish, flags, work_folder
 
 from mudg.base import config as configuration
-from mudg.models.mdm import files
-from mudg.stages.config import LearnConfig
-from mudg.stages.config.learn import LearnCodec
+from mudg.diffusion import files
+from mudg.diffusion.settings.learn import LearnCodec, LearnConfig
 from mudg.steps.learn import Learn
 
 NO_LONGER = ("textures",)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from mudg.base.errors import MudgError
     from mudg.base.types import Camera, Gaussians, Observation, PointCloud, Render, Scene, Track, Trajectory, View
     from mudg.core.raster.rasterize import rasterize
-    from mudg.data.observations import read_observations
-    from mudg.fitted import FittedScene, Picture, read_scene
+    from mudg.scene.observations import read_observations
+    from mudg.steps.fitted import FittedScene, Picture, read_scene
     from mudg.steps.functions import (
         adapt,
         annotate,
@@ -52,11 +52,11 @@ __version__ = "0.1.0"
 _FUNCTIONS = "mudg.steps.functions"
 _HOMES = {
     "Camera": "mudg.base.types",
-    "FittedScene": "mudg.fitted",
+    "FittedScene": "mudg.steps.fitted",
     "Gaussians": "mudg.base.types",
     "MudgError": "mudg.base.errors",
     "Observation": "mudg.base.types",
-    "Picture": "mudg.fitted",
+    "Picture": "mudg.steps.fitted",
     "PointCloud": "mudg.base.types",
     "Render": "mudg.base.types",
     "Scene": "mudg.base.types",
@@ -64,8 +64,8 @@ _HOMES = {
     "Trajectory": "mudg.base.types",
     "View": "mudg.base.types",
     "rasterize": "mudg.core.raster.rasterize",
-    "read_observations": "mudg.data.observations",
-    "read_scene": "mudg.fitted",
+    "read_observations": "mudg.scene.observations",
+    "read_scene": "mudg.steps.fitted",
     "adapt": _FUNCTIONS,
     "annotate": _FUNCTIONS,
     "bench": _FUNCTIONS,

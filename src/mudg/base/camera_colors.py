@@ -2,7 +2,7 @@
 
 `ColorMap` is an affine map per channel between the colours of two cameras. `CameraColors` holds, for every camera, the map to the
 *common* colours, those of one camera of the log. Fused points and fitted scenes have common colours; images on disk, recorded and
-generated, have those of their camera. The maps are found by `core/color_match.py` and travel with the fused cloud.
+generated, have those of their camera. The maps are found by `core/calibration.py` and travel with the fused cloud.
 """
 
 from __future__ import annotations

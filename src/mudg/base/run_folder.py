@@ -2,7 +2,7 @@
 
 A folder is finished when its manifest verifies and its key (verb, version, configuration, hashes of the inputs) is the one
 asked for. A finished folder of another key is replaced only on demand, and only when the new result is finished: until then that
-is made in a folder beside it (see ``replacement.py``).
+is made in a folder beside it (see ``run_folder.py``).
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import socket
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -23,10 +24,149 @@ from typing import Any
 from mudg.base import log, store
 from mudg.base.config import differences
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.base.memory import Meter, Usage, folder_bytes
 from mudg.base.processes import process_alive
 from mudg.base.records import ForeignRecord, Number, parse_record
-from mudg.base.replacement import Replacement, all_names, remove_files
-from mudg.base.usage import Meter, Usage, folder_bytes
+
+# replacement ----------------------------------------------------------------------------------------------------------
+#
+# Replacing a folder by one that was made beside it, so that nothing is lost on the way.
+#
+#     .NAME.new.part   the new content while it is made; the old content stays as it is
+#     .NAME.old.part   the old content, from the moment the new one has its name until it is removed
+#
+# Of the old content only the files of the old result are removed. Files of somebody else move to the new folder.
+
+
+OwnNames = Callable[[Path], Sequence[str]]
+"""Folder -> relative names of the files in it that belong to the result, in the order in which they may be removed: those last that
+the function itself reads. All other files belong to somebody else."""
+
+
+@dataclass(frozen=True)
+class Replacement:
+    """A folder whose content is to be replaced as a whole (links are resolved: see ``Replacement.at``)."""
+
+    folder: Path
+
+    @classmethod
+    def at(cls, path: Path) -> Replacement:
+        """For the folder that ``path`` names or links to; it need not exist."""
+        return cls(Path(os.path.realpath(path)))
+
+    @property
+    def staging(self) -> Path:
+        """Where the new content is made."""
+        return store.staging_path(self.folder)
+
+    @property
+    def retired(self) -> Path:
+        """Where the old content waits for its removal."""
+        return store.retired_path(self.folder)
+
+    def begin(self) -> Path:
+        """Make the staging folder, or take up the one that is there; returns it.
+
+        Raises:
+            ResourceError: the folder is a mount point, or its parent cannot be written.
+        """
+        if os.path.ismount(self.folder):
+            raise ResourceError("a mount point cannot be replaced", where=str(self.folder),
+                remedy="choose an --out inside it")  # fmt: skip
+        with store.disk_errors("the new result cannot be made beside the old one", self.folder.parent):
+            self.staging.mkdir(exist_ok=True)
+        return self.staging
+
+    def swap(self, own_names: OwnNames) -> None:
+        """Put the finished staging folder in the place of the folder, and remove the old result.
+
+        Raises:
+            ResourceError: a folder cannot be renamed; old and new content are both still there.
+        """
+        try:
+            if self.folder.exists():
+                self.folder.rename(self.retired)
+            self.staging.rename(self.folder)
+        except OSError as error:
+            if self.retired.exists() and not self.folder.exists():
+                self.retired.rename(self.folder)
+            raise ResourceError("the new result cannot take the place of the old one", where=str(self.folder),
+                got=str(error),
+                remedy=f"it is finished and lies in {self.staging}; repeat the command, or move it") from error  # fmt: skip
+        store.fsync_directory(self.folder.parent)
+        self._remove_retired(own_names)
+
+    def recover(self, is_finished: Callable[[Path], bool], own_names: OwnNames) -> None:
+        """Complete, or undo, a ``swap`` that was cut off by a crash; without one nothing happens.
+
+        Args:
+            is_finished: whether a folder holds a finished, unaltered result.
+
+        Raises:
+            UsageError: old and new content lie side by side in a way that no crash leaves.
+        """
+        if not self.retired.is_dir():
+            return
+        if self.folder.is_dir() and not any(self.folder.iterdir()):
+            self.folder.rmdir()
+        if not self.folder.exists():
+            if not is_finished(self.staging):
+                self.retired.rename(self.folder)
+                log.warn(f"{self.folder}: the old result is back; replacing it was cut off")
+                return
+            self.staging.rename(self.folder)
+            store.fsync_directory(self.folder.parent)
+        elif self.staging.exists() or not is_finished(self.folder):
+            raise UsageError("a cut-off replacement and another folder are in each other's way", where=str(self.folder),
+                got=f"the replaced result in {self.retired}", remedy="move one of them elsewhere")  # fmt: skip
+        log.warn(f"{self.folder}: finished replacing the old result, which had been cut off")
+        self._remove_retired(own_names)
+
+    def _remove_retired(self, own_names: OwnNames) -> None:
+        if not self.retired.is_dir():
+            return
+        own = own_names(self.retired)
+        remedy = f"the new one is in place; move what you need from here to {self.folder}"
+        with store.disk_errors("the old result cannot be removed", self.retired, remedy):
+            kept = [self._hand_over(name) for name in sorted(set(all_names(self.retired)) - set(own))]
+            remove_files(self.retired, own)
+            self.retired.rmdir()
+        if kept:
+            more = f" and {len(kept) - 8} more" if len(kept) > 8 else ""
+            log.warn(f"{self.folder}: kept files that are not of the old result: {', '.join(kept[:8])}{more}")
+
+    def _hand_over(self, name: str) -> str:
+        """Move somebody else's file from the old folder to the new one; returns its name there."""
+        target, number = name, 0
+        while os.path.lexists(self.folder / target):
+            number += 1
+            target = f"{name}.kept{number}"
+        (self.folder / target).parent.mkdir(parents=True, exist_ok=True)
+        (self.retired / name).rename(self.folder / target)
+        return target
+
+
+def all_names(folder: Path) -> list[str]:
+    """Relative POSIX names of all files and links below a folder, sorted; links are not followed."""
+    names = []
+    for place, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(place) / name).is_symlink()]
+        names += [(Path(place) / name).relative_to(folder).as_posix() for name in (*files, *links)]
+    return sorted(names)
+
+
+def remove_files(folder: Path, names: Sequence[str]) -> None:
+    """Remove files of a folder in this order, and then the sub-folders that are empty."""
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+    for place, _, _ in os.walk(folder, topdown=False):
+        if Path(place) != folder:
+            with contextlib.suppress(OSError):  # not empty: somebody else's
+                Path(place).rmdir()
+
+
+# run folder -----------------------------------------------------------------------------------------------------------
+
 
 fcntl: Any
 try:
@@ -525,3 +665,157 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
         raise ResourceError(f"another process is {busy}", where=str(what or lock.parent),
             got=f"pid {pid} on {host}",
             remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}")  # fmt: skip
+
+
+# result file ----------------------------------------------------------------------------------------------------------
+#
+# The output of a verb that is one file: one writer at a time, a description beside it, verified when the command is repeated.
+#
+#     OUT         the file; a verb may have a second form of it, such as the folder of a large page
+#     OUT.json    its description: verb, key of settings and inputs, SHA-256, and what else the verb says
+#
+# Whoever finds a file finds the description of just this file: an older file leaves before the new description gets its name, and the
+# new file gets its name last. What a stop leaves in between is completed, or undone, by the next command that writes there.
+
+
+def description_path(out: Path) -> Path:
+    """The file beside an output that says what it is."""
+    return out.with_name(f"{out.name}.json")
+
+
+class ResultFile:
+    """The output file of one verb, for this process alone. Make it at ``staged(form)``, then call ``finish``.
+
+    ``complete`` is True where the same command has finished before and the file is as it was written.
+    """
+
+    def __init__(self, out: Path, verb: str, key: str, forms: Sequence[Path]) -> None:
+        self.out, self.verb, self.key = out, verb, key
+        self.complete = False
+        self._forms = tuple(forms) or (out,)
+        self._unknown = False
+        """Whether a file without a description is there: it may be this very result, and is compared with it."""
+
+    @classmethod
+    @contextlib.contextmanager
+    def open(
+        cls, out: Path, verb: str, settings: Mapping[str, Any], inputs: Mapping[str, str], *,
+        forms: Sequence[Path] = (), overwrite: bool = False,
+    ) -> Iterator[ResultFile]:  # fmt: skip
+        """Hold the output of a verb. Call ``refuse_overlap`` first.
+
+        Args:
+            inputs: name -> digest of what is read. forms: where the result may lie (none: at ``out``). overwrite: replace what is there.
+
+        Raises:
+            UsageError: another result, or somebody else's file, is there. IntegrityError: the finished result was altered.
+            ResourceError: it cannot be written, or another live process is writing it.
+        """
+        key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
+        result = cls(Path(out), verb, key, forms)
+        with locked(_lock_path(out), out):
+            try:
+                result._recover()
+                result._examine(overwrite)
+                yield result
+            finally:
+                result._tidy()
+
+    @property
+    def path(self) -> Path:
+        """Where the file is made."""
+        return self.staged()
+
+    def staged(self, form: Path | None = None) -> Path:
+        """Where the content of a form is made."""
+        form = form or self.out
+        return form.with_name(f".{form.name}.new.part{form.suffix}")
+
+    def finish(self, about: Mapping[str, Any], form: Path | None = None) -> Path:
+        """Give what was made its name, and its description; returns where it lies.
+
+        Raises:
+            UsageError: a file that nothing describes is there, and it is another.
+        """
+        form = form or self.out
+        old = [one for one in self._forms if os.path.lexists(one)]
+        values = {
+            "schema": 1, "verb": self.verb, "key": self.key, "file": form.name, "sha256": store.digest(self.staged(form)), **about
+        }  # fmt: skip
+        if self._unknown and (old != [form] or store.digest(form) != values["sha256"]):
+            raise UsageError("the file exists", where=str(old[0]), remedy="choose another --out, or add --overwrite")
+        with store.disk_errors("the result cannot get its name", form):
+            if self._unknown:
+                store.write_json(description_path(self.out), values)
+                log.info(f"{self.verb}: {form} was there, and is the same")
+                return form
+            for one in old:
+                one.rename(self._retired(one))
+            store.write_json(description_path(self.out), values)
+            self.staged(form).rename(form)
+            store.fsync_directory(form.parent)
+        return form
+
+    def reused(self) -> Path:
+        """Say that an earlier result is used again, and return where it lies."""
+        form = next(one for one in self._forms if os.path.lexists(one))
+        log.info(f"{self.verb}: reused {form} (verified)")
+        return form
+
+    def _retired(self, form: Path) -> Path:
+        return form.with_name(f".{form.name}.old.part{form.suffix}")
+
+    def description(self) -> dict[str, Any]:
+        """What ``OUT.json`` says; empty where it is missing or somebody else's."""
+        try:
+            found = store.read_json(description_path(self.out))
+        except InputError:
+            return {}
+        known = isinstance(found, dict) and all(isinstance(found.get(name), str) for name in ("verb", "key", "file", "sha256"))
+        return found if known else {}
+
+    def _examine(self, overwrite: bool) -> None:
+        about, file = self.description(), description_path(self.out)
+        if os.path.lexists(self.out) and not self.out.is_file():
+            raise ResourceError("cannot write here", where=str(self.out), got="not a regular file", remedy="choose another --out")
+        there = [one for one in self._forms if os.path.lexists(one)]
+        if about.get("key") == self.key and [one.name for one in there] == [about["file"]]:
+            self.complete = store.digest(there[0]) == about["sha256"]
+            if not (self.complete or overwrite):
+                raise IntegrityError("a file was altered after it was written", where=str(there[0]), expected=f"sha256 {about['sha256']}",
+                    remedy="add --overwrite to make it again, or choose another --out")  # fmt: skip
+        elif not overwrite:
+            self._unknown = bool(there) and not os.path.lexists(file)
+            blocked = (not there and not about and os.path.lexists(file)) or (there and not self._unknown)
+            if blocked:
+                got = "a result of other settings or inputs" if about else "a file of something else"
+                raise UsageError("the file exists", where=str(there[0] if there else file), got=got,
+                    remedy="choose another --out, or add --overwrite")  # fmt: skip
+
+    def _recover(self) -> None:
+        """Complete a ``finish`` that was cut off after its description was written, undo one that was before."""
+        if any(os.path.lexists(one) for one in self._forms):
+            return
+        wanted = self.description().get("sha256")
+        for one in self._forms:
+            if self.staged(one).exists() and store.digest(self.staged(one)) == wanted:
+                self.staged(one).rename(one)
+                return
+        for one in self._forms:
+            if os.path.lexists(self._retired(one)):
+                self._retired(one).rename(one)
+
+    def _tidy(self) -> None:
+        """Remove what this and earlier, killed commands left: no other is at work here."""
+        ends = [(one, r"[a-z0-9_]{8}\.part") for one in (*self._forms, description_path(self.out), _lock_path(self.out))]
+        names = [re.escape(f".{one.stem}.") + end + re.escape(one.suffix) for one, end in ends]
+        for one in self._forms:
+            names += [re.escape(self._retired(one).name), rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*"]
+        left = re.compile("|".join(names))
+        with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
+            for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:
+                shutil.rmtree(one) if one.is_dir() and not one.is_symlink() else one.unlink()
+
+
+def _lock_path(out: Path) -> Path:
+    return out.with_name(f".{out.name}.lock")

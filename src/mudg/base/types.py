@@ -10,19 +10,156 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import checks, geometry
+from mudg.base import geometry
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
-from mudg.base.renders import RenderPlanes
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+
+# checks ---------------------------------------------------------------------------------------------------------------
+#
+# What the constructors of ``base/types.py`` check. Each refusal is an InputError whose place is ``OWNER: FIELD``.
+
+
+def rigid(value: Any, where: str) -> Matrix:
+    """A read-only copy f64[4, 4] of a rigid motion."""
+    matrix = np.array(value, np.float64)
+    problem = geometry.rigid_problem(matrix)
+    if problem:
+        raise InputError("pose is not a rigid motion", where=where, got=problem,
+            expected="f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres",
+            remedy="remove scale or mirroring from the matrix; check row against column order")  # fmt: skip
+    matrix.setflags(write=False)
+    return matrix
+
+
+MAX_NAME_BYTES: Final = 200
+
+
+def foreign_name(value: str, where: str) -> str:
+    """An id, name or class from a file of others, at most 200 bytes long."""
+    size = len(value) if len(value) > MAX_NAME_BYTES else len(value.encode("utf-8", "surrogatepass"))
+    if size > MAX_NAME_BYTES:
+        raise InputError("name is too long", where=where, expected=f"at most {MAX_NAME_BYTES} bytes",
+            got=f"{size} bytes, beginning {value[:40]!r}", remedy="is the file damaged, or of another format?")  # fmt: skip
+    return value
+
+
+def finite(value: float, where: str) -> float:
+    """A finite number as a float."""
+    number = float(value)
+    if not np.isfinite(number):
+        raise InputError("a number is not finite", where=where, got=str(value))
+    return number
+
+
+def increasing_problem(times_s: NDArray[np.float64]) -> str | None:
+    """Say where times f64[T] in seconds stop increasing, or return None."""
+    stops = np.flatnonzero(~(np.diff(times_s) > 0))
+    if len(stops) == 0:
+        return None
+    index = int(stops[0])
+    return f"entry {index + 1} ({times_s[index + 1]:.6f} s) does not come after entry {index} ({times_s[index]:.6f} s)"
+
+
+def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[np.float64], Matrix]:
+    """Check and freeze interpolation keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field ``name``."""
+    times = np.array(times_s, np.float64).reshape(-1)
+    matrices = np.array(poses, np.float64)
+    if matrices.shape != (len(times), 4, 4):
+        expected, got = f"({len(times)}, 4, 4) for {len(times)} times", str(matrices.shape)
+        raise InputError("times and poses do not pair up", where=f"{owner}: {name}", expected=expected, got=got)
+    problem = increasing_problem(times) if np.isfinite(times).all() else shortened(times)
+    if problem is not None:
+        raise InputError("times do not increase", where=f"{owner}: times_s",
+            expected="finite seconds, strictly increasing", got=problem,
+            remedy="sort the poses by time and drop duplicates")  # fmt: skip
+    if not geometry.all_rigid(matrices):
+        for index, matrix in enumerate(matrices):
+            rigid(matrix, f"{owner}: {name}[{index}]")
+    times.setflags(write=False)
+    matrices.setflags(write=False)
+    return times, matrices
+
+
+def shortened(values: NDArray[Any]) -> str:
+    """Numbers as text, at most about 200 characters."""
+    text = np.array2string(np.asarray(values), threshold=6, edgeitems=3, precision=6)
+    return text if len(text) < 200 else text[:200] + "..."
+
+
+def _fits(shape: Any, expected: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(expected) and all(e in (None, s) for s, e in zip(shape, expected, strict=True))
+
+
+def check_array(value: Any, where: str, shape: tuple[int | None, ...], dtype: type[np.generic]) -> None:
+    """Refuse what is no array of this shape and type; None stands for any size."""
+    got = getattr(value, "shape", None)
+    if got is None or not _fits(got, shape) or not np.issubdtype(value.dtype, dtype):
+        expected = f"{np.dtype(dtype).name} {shape}".replace("None", "N")
+        found = f"{getattr(value, 'dtype', type(value).__name__)} {got}"
+        raise InputError("an array has the wrong shape or type", where=where, expected=expected, got=found)
+
+
+def check_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
+    """Compare the shapes of tensor fields with the expected ones; None stands for any size."""
+    for name, shape in shapes.items():
+        got = tuple(getattr(getattr(record, name), "shape", ()))
+        if not _fits(got, shape):
+            where, expected = f"{type(record).__name__.lower()}.{name}", str(shape).replace("None", "N")
+            raise InputError("a tensor has the wrong shape", where=where, expected=expected, got=str(got))
+
+
+def check_given_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
+    """As ``check_tensors``, for fields that may be None."""
+    check_tensors(record, **{name: shape for name, shape in shapes.items() if getattr(record, name) is not None})
+
+
+# what a fitted scene shows at some views, as the diffusion model's condition holds it. Imports no torch ---------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderPlanes:
+    """What a fitted scene shows at T views (or at one view, without the leading dimension).
+
+    Args:
+        color: f32[T, 3, H, W] in [0, 1], sky included.
+        depth: f32[T, 1, H, W] metres; meaningless where ``alpha`` is small.
+        alpha: f32[T, 1, H, W] in [0, 1]: coverage by Gaussians.
+        certainty: f32[T, 1, H, W] in [0, 1]: how far the photographs determined what is shown; never above ``alpha``.
+        semantics: u8[T, 1, H, W] class ids; 255 = unknown.
+    """
+
+    color: Tensor
+    depth: Tensor
+    alpha: Tensor
+    certainty: Tensor
+    semantics: Tensor
+
+    def __post_init__(self) -> None:
+        lead, (h, w) = tuple(self.color.shape[:-3]), tuple(self.color.shape[-2:])
+        one = (*lead, 1, h, w)
+        check_tensors(self, color=(*lead, 3, h, w), depth=one, alpha=one, certainty=one, semantics=one)
+
+    def to(self, device: torch.device) -> RenderPlanes:
+        """The same planes on a device."""
+        return self.map(lambda x: x.to(device))
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> RenderPlanes:
+        """The planes with ``change`` applied to each, for example a crop or a mirror image."""
+        return RenderPlanes(*(change(getattr(self, f.name)) for f in fields(self)))
+
+
+# types ----------------------------------------------------------------------------------------------------------------
+
 
 Matrix = NDArray[np.float64]
 TrajectoryOrigin = Literal["recorded", "shifted"]
@@ -69,7 +206,7 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise InputError("image size must be positive", where=owner, got=f"{self.width}x{self.height}")
         for name in ("fx", "fy", "cx", "cy", "readout_s"):
-            checks.finite(getattr(self, name), f"{owner}.{name}")
+            finite(getattr(self, name), f"{owner}.{name}")
         if self.fx <= 0 or self.fy <= 0:
             raise InputError("focal lengths must be positive", where=owner, got=f"fx={self.fx}, fy={self.fy}")
         if self.readout_s < 0:
@@ -110,8 +247,8 @@ class View:
 
     def __post_init__(self) -> None:
         owner = f"view of {self.camera.name!r}"
-        object.__setattr__(self, "world_from_cam", checks.rigid(self.world_from_cam, f"{owner}: world_from_cam"))
-        object.__setattr__(self, "time_s", checks.finite(self.time_s, f"{owner}: time_s"))
+        object.__setattr__(self, "world_from_cam", rigid(self.world_from_cam, f"{owner}: world_from_cam"))
+        object.__setattr__(self, "time_s", finite(self.time_s, f"{owner}: time_s"))
 
     @property
     def cam_from_world(self) -> Matrix:
@@ -203,9 +340,9 @@ class Sweep:
     points: Ref
 
     def __post_init__(self) -> None:
-        pose = checks.rigid(self.world_from_lidar, f"sweep {self.id!r}: world_from_lidar")
+        pose = rigid(self.world_from_lidar, f"sweep {self.id!r}: world_from_lidar")
         object.__setattr__(self, "world_from_lidar", pose)
-        object.__setattr__(self, "time_s", checks.finite(self.time_s, f"sweep {self.id!r}: time_s"))
+        object.__setattr__(self, "time_s", finite(self.time_s, f"sweep {self.id!r}: time_s"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,11 +364,11 @@ class SweepPoints:
     no_returns: int = 0
 
     def __post_init__(self) -> None:
-        checks.check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
-        checks.check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
-        checks.check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
+        check_array(self.xyz, "sweep points: xyz", (None, 3), np.float32)
+        check_array(self.intensity, "sweep points: intensity", (len(self.xyz),), np.float32)
+        check_array(self.dt_s, "sweep points: dt_s", (len(self.xyz),), np.float32)
         if self.classes is not None:
-            checks.check_array(self.classes, "sweep points: classes", (len(self.xyz),), np.uint8)
+            check_array(self.classes, "sweep points: classes", (len(self.xyz),), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,13 +392,13 @@ class Track:
     def __post_init__(self) -> None:
         owner = f"track {self.id[:40]!r}"
         for name in ("id", "label"):
-            checks.foreign_name(getattr(self, name), f"{owner}: {name}")
+            foreign_name(getattr(self, name), f"{owner}: {name}")
         size = np.array(self.size_m, np.float64).reshape(-1)
         if size.shape != (3,) or not np.isfinite(size).all() or (size <= 0).any():
             what = "a box needs a positive length, width and height"
-            raise InputError(what, where=f"{owner}: size_m", got=checks.shortened(size))
+            raise InputError(what, where=f"{owner}: size_m", got=shortened(size))
         size.setflags(write=False)
-        times, poses = checks.pose_keys(self.times_s, self.world_from_object, owner, "world_from_object")
+        times, poses = pose_keys(self.times_s, self.world_from_object, owner, "world_from_object")
         if len(times) == 0:
             raise InputError("a track needs at least one box", where=f"{owner}: times_s")
         object.__setattr__(self, "size_m", size)
@@ -286,7 +423,7 @@ class EgoPath:
     world_from_ego: Matrix
 
     def __post_init__(self) -> None:
-        times, poses = checks.pose_keys(self.times_s, self.world_from_ego, "ego path", "world_from_ego")
+        times, poses = pose_keys(self.times_s, self.world_from_ego, "ego path", "world_from_ego")
         object.__setattr__(self, "times_s", times)
         object.__setattr__(self, "world_from_ego", poses)
 
@@ -329,10 +466,10 @@ class PointCloud:
     semantics: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
-        checks.check_array(self.xyz, "point cloud: xyz", (None, 3), np.float32)
-        checks.check_array(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
+        check_array(self.xyz, "point cloud: xyz", (None, 3), np.float32)
+        check_array(self.rgb, "point cloud: rgb", (len(self.xyz), 3), np.uint8)
         if self.semantics is not None:
-            checks.check_array(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
+            check_array(self.semantics, "point cloud: semantics", (len(self.xyz),), np.uint8)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -413,7 +550,7 @@ class SparseDepth:
     valid: Tensor
 
     def __post_init__(self) -> None:
-        checks.check_tensors(self, depth=(None, 1, None, None), valid=tuple(self.depth.shape))
+        check_tensors(self, depth=(None, 1, None, None), valid=tuple(self.depth.shape))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> SparseDepth:
         """Depth and mask with ``change`` applied to each, for example a crop or a mirror image."""
@@ -457,12 +594,12 @@ class Condition:
     def __post_init__(self) -> None:
         t, (h, w) = len(self.views), tuple(self.color.shape[-2:])
         one = (t, 1, h, w)
-        checks.check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
-        checks.check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
+        check_tensors(self, color=(t, 3, h, w), depth=one, valid=one, reference=(3, h, w))
+        check_given_tensors(self, warped=one, backdrop=(t, 3, h, w), semantics=one, backdrop_semantics=one)
         if self.renders is not None:
-            checks.check_tensors(self.renders, color=(t, 3, h, w))
+            check_tensors(self.renders, color=(t, 3, h, w))
         if self.measured is not None:
-            checks.check_tensors(self.measured, depth=one)
+            check_tensors(self.measured, depth=one)
 
     @property
     def measurement(self) -> SparseDepth:
@@ -523,8 +660,8 @@ class Clip:
     def __post_init__(self) -> None:
         t, _, h, w = self.condition.color.shape
         one = (t, 1, h, w)
-        checks.check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
-        checks.check_given_tensors(self, point_color=(t, 3, h, w), depth_confidence=one)
+        check_tensors(self, rgb=(t, 3, h, w), depth=one, depth_valid=one, semantics=(t, h, w))
+        check_given_tensors(self, point_color=(t, 3, h, w), depth_confidence=one)
 
     @property
     def depth_weight(self) -> Tensor:
@@ -564,8 +701,8 @@ class Observation:
 
     def __post_init__(self) -> None:
         h, w = self.view.camera.height, self.view.camera.width
-        checks.check_tensors(self, rgb=(3, h, w), confidence=(1, h, w), mask=(1, h, w))
-        checks.check_given_tensors(self, depth=(1, h, w), semantics=(h, w))
+        check_tensors(self, rgb=(3, h, w), confidence=(1, h, w), mask=(1, h, w))
+        check_given_tensors(self, depth=(1, h, w), semantics=(h, w))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -596,8 +733,8 @@ class Gaussians:
     def __post_init__(self) -> None:
         n = self.means.shape[0]
         sh = (n, None if self.sh_rest is None else 1, 3)
-        checks.check_tensors(self, means=(n, 3), quats=(n, 4), scales=(n, 3), opacity=(n,), sh=sh, node=(n,))
-        checks.check_given_tensors(self, sh_rest=(n, None, 3), extra=(n, None))
+        check_tensors(self, means=(n, 3), quats=(n, 4), scales=(n, 3), opacity=(n,), sh=sh, node=(n,))
+        check_given_tensors(self, sh_rest=(n, None, 3), extra=(n, None))
 
     def __len__(self) -> int:
         return int(self.means.shape[0])

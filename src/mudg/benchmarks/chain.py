@@ -19,11 +19,14 @@ from mudg.base.run_folder import RunDir
 from mudg.base.types import Trajectory
 from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.rows import EXACT, FILL, LONGER, REPAIRED, Row, usual_fit
-from mudg.data.cloudfile import read_fused
-from mudg.data.observations import ObservationWriter, list_observation_sets, read_observations
-from mudg.data.scene import read_scene
-from mudg.stages import score
-from mudg.stages.config import BenchConfig, FitConfig, RenderConfig, SynthesizeConfig
+from mudg.benchmarks.settings import BenchConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.editing.view_settings import RenderConfig
+from mudg.gaussians.settings import FitConfig
+from mudg.scene.clouds import read_fused
+from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.scene.read import read_scene
+from mudg.scoring import score
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.outputs import Output

@@ -26,15 +26,15 @@ from mudg.base.types import Observation, Scene, View
 from mudg.benchmarks.places import Protocol
 from mudg.benchmarks.truth import Target, Targets, read_targets
 from mudg.core import metrics
+from mudg.core.lidar import DEPTH_LIMIT_M
 from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.core.points_seen import DEPTH_LIMIT_M
-from mudg.data.exporters.video import jpeg_bytes
-from mudg.data.observations import list_observation_sets, read_observations
-from mudg.data.scene import read_scene
-from mudg.models.featnets import CodecFeatures, PerceptualDistance
-from mudg.models.mdm import files as mdm_files
-from mudg.stages.score import evenly
-from mudg.stages.score_truth import SAME_PLACE_M, SAME_TIME_S, apart_m
+from mudg.diffusion import files as mdm_files
+from mudg.formats.exporters.video import jpeg_bytes
+from mudg.networks.featnets import CodecFeatures, PerceptualDistance
+from mudg.scene.observations import list_observation_sets, read_observations
+from mudg.scene.read import read_scene
+from mudg.scoring.score import evenly
+from mudg.scoring.truth import SAME_PLACE_M, SAME_TIME_S, apart_m
 from mudg.steps.outputs import Output
 
 PERCEPTUAL_VIEWS: Final = 12

@@ -18,7 +18,7 @@ With several cities the vehicle of each is also replaced by that of the next one
 vehicle over that of the render, in linear light: 1 = as bright as it should be.
 
 With a diffusion model (``--harmonize``) three edits are made in three ways: the fitted scene with the edits; its frames with the touched
-pixels repaired by the model (``stages/editing/harmonised.py``); renders of a fit that goes on for as many steps again on an edited drive
+pixels repaired by the model (``editing/harmonised.py``); renders of a fit that goes on for as many steps again on an edited drive
 whose images are such frames. Besides a fit of the same city in which the object was never there: what a scene of this size can show at
 all. `insert` takes the object away and puts its own asset in 3 m ahead, so that the truth is that of the move.
 """
@@ -39,31 +39,33 @@ from scipy import ndimage
 
 from mudg.base import geometry, log
 from mudg.base.errors import InputError
+from mudg.base.html import cells, markdown_table
 from mudg.base.types import Observation, Scene, View
 from mudg.benchmarks import poses as bench_poses
 from mudg.benchmarks.columns import shipped_features
 from mudg.benchmarks.loop import finished
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city.logs import write_world
+from mudg.city.world import CityWorld
 from mudg.core import metrics
 from mudg.core.edit import Motion
-from mudg.core.edit_scores import SAME
-from mudg.core.perceptual import lpips_distance, unit_features
+from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.raster.rasterize import rasterize
-from mudg.data.city import CityWorld
-from mudg.data.city.recording import write_world
-from mudg.data.edits import parse_edits
-from mudg.data.scene import read_label, read_scene
-from mudg.models.scene.edited import linear_of
-from mudg.models.scene.model import SceneModel, compose
-from mudg.pages.tables import cells, markdown_table
-from mudg.stages import fit
-from mudg.stages.config import BenchConfig, EditConfig, HarmonizeConfig
-from mudg.stages.editing.assets import complete_asset, write_asset
-from mudg.stages.editing.carried import EditedDrive, carry_out
-from mudg.stages.editing.harmonised import repairing
-from mudg.stages.editing.written import DriveChange, EditedImages, write_edited_scene
-from mudg.stages.fitting.continued import StartFit, whole_run
-from mudg.stages.fitting.rendering import raster_of, render_view
-from mudg.stages.fitting.storage import save_model
+from mudg.core.view_metrics import SAME
+from mudg.diffusion.settings.harmonize import HarmonizeConfig
+from mudg.editing.assets import complete_asset, write_asset
+from mudg.editing.carried import EditedDrive, carry_out
+from mudg.editing.harmonised import repairing
+from mudg.editing.model import linear_of
+from mudg.editing.recorded import DriveChange, EditedImages, write_edited_scene
+from mudg.editing.script import parse_edits
+from mudg.editing.settings import EditConfig
+from mudg.gaussians import fit
+from mudg.gaussians.model import SceneModel, compose
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.gaussians.storage import StartFit, save_model, whole_run
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_scene
 
 MOVE: Final = "- move: {id: ID, along_m: 3, ground: false}"
 EDITS: Final = {

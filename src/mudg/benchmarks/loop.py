@@ -14,8 +14,8 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import is_temporary
+from mudg.benchmarks.settings import BenchConfig
 from mudg.core.raster.place import drawing_device
-from mudg.stages.config import BenchConfig
 from mudg.steps.engine import Result
 
 

@@ -13,18 +13,19 @@ import torch
 
 from mudg.base import log
 from mudg.base.devices import NETWORK_KINDS, choose_device
-from mudg.core import flicker
-from mudg.data.clips import from_city
-from mudg.data.clips.condition import ConditionRules, WarpSource, build_conditions
-from mudg.data.clips.from_city import CityClipRules
-from mudg.models.diffusion import SampleRequest, generated
-from mudg.models.mdm import files as mdm_files
-from mudg.models.mdm.model import MDM
-from mudg.stages.config import BenchConfig, SynthesizeConfig
-from mudg.stages.learning import score as learn_score
-from mudg.stages.learning.city_fits import fit_city
-from mudg.stages.learning.precision import choose_bf16
-from mudg.stages.learning.views import windows
+from mudg.benchmarks.settings import BenchConfig
+from mudg.core import metrics as flicker
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.clips import from_city
+from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions
+from mudg.diffusion.clips.from_city import CityClipRules
+from mudg.diffusion.model import MDM
+from mudg.diffusion.requests import SampleRequest, generated
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.training import score as learn_score
+from mudg.diffusion.training.clips import fit_city
+from mudg.diffusion.training.memory_plan import choose_bf16
+from mudg.diffusion.views import windows
 
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
 

@@ -14,17 +14,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import store
+from mudg.base import html, store
 from mudg.base.errors import InputError
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Trajectory
 from mudg.core.pictures import resize_area
-from mudg.data.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
-from mudg.data.observations import ObservationSet, list_observation_sets, read_observations
-from mudg.pages import html
-from mudg.pages.page import FPS, shift_title
-from mudg.pages.panels import panel_grid, panel_size
+from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
 from mudg.steps.outputs import Output
+from mudg.viewer.report import FPS, panel_grid, panel_size, shift_title
 
 PANEL_WIDTH: Final = 320
 ENCODING: Final = Encoding(FPS, first_crf=29, last_crf=41, preset="veryfast")

@@ -27,23 +27,24 @@ from numpy.typing import NDArray
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
+from mudg.base.html import markdown as rendered
 from mudg.base.run_folder import refuse_overlap
 from mudg.benchmarks import page as pages
 from mudg.benchmarks.loop import compare, refuse_foreign, seconds_of
 from mudg.benchmarks.papers import PAPERS, TABLES, PaperColumn, PaperTable
 from mudg.benchmarks.places import ListedCity, first_camera, logs_of, missing_scenes
 from mudg.benchmarks.rows import FILL, REPAIRED, Row, chain_settings, generator_of, paper_rows, refuse_unfit
+from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error, virtual_fits_of
 from mudg.benchmarks.views import TRUTH, Views, of_log, score_settings
 from mudg.core.metrics import METRICS
-from mudg.methods import METHODS
-from mudg.models.mdm import files as mdm_files
-from mudg.pages.score_tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
-from mudg.pages.tables import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
-from mudg.pages.tables import markdown as rendered
-from mudg.stages.config import BenchConfig, PresetName, ScoreConfig
-from mudg.stages.scoring.distributions import FEATURES_FOLDER, FEWEST, distances
-from mudg.stages.scoring.videos import compared
+from mudg.diffusion import files as mdm_files
+from mudg.editing.view_settings import ScoreConfig
+from mudg.gaussians.methods import METHODS
+from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
+from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
+from mudg.steps.settings.presets import PresetName
 
 PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
 ANCHORS: Final = {TRUTH: "the truth itself", FILL: "fused points, holes filled"}

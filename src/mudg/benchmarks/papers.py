@@ -12,8 +12,8 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.records import StrictRecord, checked_by, parse_record
-from mudg.methods import METHODS
-from mudg.models.inception import ResizeRule
+from mudg.gaussians.methods import METHODS
+from mudg.networks.inception import ResizeRule
 
 FILE: Final = Path(__file__).with_name("papers.yaml")
 RECORDED: Final = "0"

@@ -21,16 +21,20 @@ from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Frame, Scene
 from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.papers import SCENE_LISTS, PaperTable
-from mudg.data.city import logs as city_logs
-from mudg.data.city.logs import STANDARD, LogRules
-from mudg.data.importers.options import holdout_split, parse_frame_range, parse_resolution
-from mudg.data.scene import read_scene
-from mudg.data.scene.part import write_part
-from mudg.stages import annotate, ingest
-from mudg.stages.config import AnnotateConfig, BenchConfig, IngestConfig, on_device
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city import logs as city_logs
+from mudg.city.logs import STANDARD, LogRules
+from mudg.formats import ingest
+from mudg.formats.importers.common import holdout_split, parse_frame_range, parse_resolution
+from mudg.formats.settings import IngestConfig
+from mudg.labels import annotate
+from mudg.labels.settings import AnnotateConfig
+from mudg.scene.part import write_part
+from mudg.scene.read import read_scene
 from mudg.steps.annotate import Annotate
 from mudg.steps.ingest import Ingest
 from mudg.steps.outputs import Output
+from mudg.steps.settings.run import on_device
 
 CITY: Final = "city:"
 """How the name of a list of generated cities begins."""
@@ -77,7 +81,7 @@ def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> 
     """The logs that a table is filled with.
 
     Args:
-        sources: ``city:NAME`` alone (see ``data/city/logs.py``), or folders of recorded logs.
+        sources: ``city:NAME`` alone (see ``city/logs.py``), or folders of recorded logs.
 
     Raises:
         UsageError: no log, an unknown list, lists and folders together, or settings that make no sense for them.

@@ -31,22 +31,25 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry, log, seeds
 from mudg.base.config import result_settings
+from mudg.base.html import markdown_table
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene, Track
 from mudg.benchmarks.loop import finished
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city.config import CityConfig
+from mudg.city.logs import write_city
 from mudg.core import metrics
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.raster.place import drawing_device
-from mudg.data.city import CityConfig, write_city
-from mudg.data.scene import read_image, read_label, read_scene
-from mudg.models.scene.model import SceneModel
-from mudg.models.scene.nodes import RigidNode
-from mudg.pages.tables import markdown_table
-from mudg.stages import fit
-from mudg.stages.config import BenchConfig, FitConfig, FuseConfig
-from mudg.stages.config.fit import DensifyConfig, PoseConfig, RecordedLossConfig, StartConfig
-from mudg.stages.fitting.rendering import raster_of
-from mudg.stages.fuse import rules_of, scene_sweeps
+from mudg.gaussians import fit
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.rendering import raster_of
+from mudg.gaussians.settings import DensifyConfig, FitConfig, PoseConfig, RecordedLossConfig, StartConfig
+from mudg.scene.fuse import rules_of, scene_sweeps
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_scene
+from mudg.scene.settings import FuseConfig
 
 LISTS: dict[str, tuple[int, ...]] = {
     "development": (2_000_000, 2_000_001, 2_000_002, 2_000_003),

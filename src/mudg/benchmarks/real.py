@@ -2,7 +2,7 @@
 
 A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log and way of
 hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is hidden was removed
-(``data/scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
+(``scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
 
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
     OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out frames
@@ -22,6 +22,8 @@ from typing import Any, Final
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.base.html import TextTable, markdown_table
+from mudg.base.html import markdown as rendered
 from mudg.base.layout import SCENE_FILES
 from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Scene
@@ -42,18 +44,20 @@ from mudg.benchmarks.places import (
     protocols_of,
 )
 from mudg.benchmarks.rows import BASE, FILL, Row, Sees, chain_settings, generator_of, real_rows, refuse_unfit
+from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import virtual_fits_of
 from mudg.benchmarks.truth import MakeTargets, read_targets
-from mudg.data.scene import read_scene
-from mudg.data.scene.part import write_part
-from mudg.models.mdm import files as mdm_files
-from mudg.pages.tables import TextTable, markdown_table
-from mudg.pages.tables import markdown as rendered
-from mudg.stages import render
-from mudg.stages.adapting.clips import why_not
-from mudg.stages.config import AdaptConfig, BenchConfig, PresetName, RenderConfig, on_device
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.adapt import why_not
+from mudg.diffusion.settings.adapt import AdaptConfig
+from mudg.editing import render
+from mudg.editing.view_settings import RenderConfig
+from mudg.scene.part import write_part
+from mudg.scene.read import read_scene
 from mudg.steps.adapt import Adapt
 from mudg.steps.outputs import Output
+from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings.run import on_device
 
 PAGES: Final = ("bench.json", "bench.md", "page.html")
 

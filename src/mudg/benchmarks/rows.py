@@ -11,15 +11,18 @@ from mudg.base import config as configuration
 from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import parse_yaml
 from mudg.benchmarks.papers import PaperTable
-from mudg.methods import METHODS, PUBLISHED
-from mudg.models.mdm import files as mdm_files
-from mudg.models.published.files import is_published
-from mudg.pages.score_tables import title_of
-from mudg.stages import score
-from mudg.stages.config import BenchConfig, FitConfig, PresetName, SynthesizeConfig, bench_preset
-from mudg.stages.fitting.recipes import recipe_of
-from mudg.stages.learning import loading
+from mudg.benchmarks.settings import BenchConfig, bench_preset
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion import views as loading
+from mudg.diffusion.published.model import is_published
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.gaussians.methods import METHODS, PUBLISHED
+from mudg.gaussians.recipes import recipe_of
+from mudg.gaussians.settings import FitConfig
+from mudg.scoring import score
+from mudg.scoring.tables import title_of
 from mudg.steps.pipeline import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
+from mudg.steps.settings.presets import PresetName
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, WITHOUT_DIFFUSION, "mudg_r", "mudg_s"
 LONGER: Final = f"{BASE}-longer"

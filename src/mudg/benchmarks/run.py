@@ -27,10 +27,12 @@ from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.benchmarks import edit, edit_runs, mdm, paper, poses, real, shift
 from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
-from mudg.models.mdm import files as mdm_files
-from mudg.models.published.files import is_published
-from mudg.stages.config import BenchConfig, FitConfig, PresetName, bench_preset
+from mudg.benchmarks.settings import BenchConfig, bench_preset
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.published.model import is_published
+from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
+from mudg.steps.settings.presets import PresetName
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 EDIT, SHIFT, REAL, PAPER = "edit", "shift", "real", "paper"

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import config as configuration
+from mudg.base.html import TextTable, markdown_table
 from mudg.base.run_folder import refuse_overlap
 from mudg.benchmarks import page as pages
 from mudg.benchmarks.loop import compare, refuse_foreign, seconds_of
@@ -33,12 +34,12 @@ from mudg.benchmarks.rows import (
     refuse_unfit,
     shift_rows,
 )
+from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.views import Views, score_settings
-from mudg.data.city import logs as city_logs
-from mudg.data.city.logs import STANDARD, LogRules
-from mudg.models.mdm import files as mdm_files
-from mudg.pages.tables import TextTable, markdown_table
-from mudg.stages.config import BenchConfig, PresetName
+from mudg.city import logs as city_logs
+from mudg.city.logs import STANDARD, LogRules
+from mudg.diffusion import files as mdm_files
+from mudg.steps.settings.presets import PresetName
 
 SHIFTED: Final = "shifted"
 """The mean over the lateral distances."""

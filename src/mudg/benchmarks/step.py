@@ -11,7 +11,8 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.stages.config import BenchConfig, PresetName
+    from mudg.benchmarks.settings import BenchConfig
+    from mudg.steps.settings.presets import PresetName
 
 
 class Bench(Output):
@@ -47,7 +48,7 @@ class Bench(Output):
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> BenchConfig:
         """Preset, then the file, then single settings."""
         from mudg.base import config as configuration
-        from mudg.stages import config as c
+        from mudg.steps import settings as c
 
         return configuration.load(c.BenchConfig, c.bench_preset(inputs["preset"]), file, given)
 

@@ -25,15 +25,17 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene, View
 from mudg.benchmarks.places import Protocol
-from mudg.core import color_match, points_seen, trajectory
+from mudg.core import calibration as color_match
+from mudg.core import lidar as points_seen
+from mudg.core import trajectory
 from mudg.core.fusion import STATIC
+from mudg.core.lidar import OwnedPoints, ShownFrame
 from mudg.core.pictures import class_colors, depth_colors
-from mudg.core.points_seen import OwnedPoints, ShownFrame
-from mudg.data.exporters.video import jpeg_bytes
-from mudg.data.scene import read_image, read_scene
-from mudg.models.labels.inputs import box_outline
-from mudg.stages.scoring import log_points
-from mudg.stages.scoring.log_points import LogPoints
+from mudg.formats.exporters.video import jpeg_bytes
+from mudg.labels.inputs import box_outline
+from mudg.scene.read import read_image, read_scene
+from mudg.scoring import truth as log_points
+from mudg.scoring.truth import LogPoints
 from mudg.steps.outputs import Output
 
 LEAST_SEEN: Final = 0.05

@@ -19,11 +19,14 @@ from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.papers import RECORDED, PaperTable
 from mudg.benchmarks.places import ListedCity, Log, first_camera, make_scene
 from mudg.benchmarks.rows import EXACT, FILL, Row, generator_of
-from mudg.data.scene import read_scene
-from mudg.methods import METHODS
-from mudg.stages import render
-from mudg.stages.config import BenchConfig, RenderConfig, ScoreConfig, SynthesizeConfig, on_device
+from mudg.benchmarks.settings import BenchConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.editing import render
+from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.gaussians.methods import METHODS
+from mudg.scene.read import read_scene
 from mudg.steps.score import DrawTruth, Score
+from mudg.steps.settings.run import on_device
 
 TRUTH: Final = "truth"
 ALL_VIEWS: Final = 1_000_000

@@ -1,7 +1,7 @@
 """Distances between two sets of feature vectors: how far the distribution of generated images is from that of real ones.
 
 All take two arrays ``[n, d]`` and ``[m, d]`` (rows are images, any real dtype), compute in float64 on the CPU and return a plain
-number. Smaller is better everywhere. What the features are decides the name of the number: with those of ``models/inception.py``
+number. Smaller is better everywhere. What the features are decides the name of the number: with those of ``networks/inception.py``
 ``frechet_distance`` is FID and ``kernel_distance`` is KID.
 
 All of them depend on the number of rows. The Frechet distance of two small samples of the *same* law is far from 0: with FID's

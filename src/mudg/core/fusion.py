@@ -13,7 +13,7 @@ The rules, stated once:
 * **Colour.** A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the object's
   motion between sweep and image taken into account. If several cameras see it, the one whose optical axis points
   closest to it wins. Points that no camera sees have no colour and are left out. Cameras whose exposure or white balance differs are
-  brought to the colours of one of them first (``core/color_match.py``).
+  brought to the colours of one of them first (``core/calibration.py``).
 * **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects included,
   the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
 * **Semantics.** A point keeps the class that people gave it. For others the cameras that see a point vote, weighted by the cosine to their
@@ -36,8 +36,7 @@ from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
 from mudg.base.geometry import invert, pinhole, yaw_of
 from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
-from mudg.core.visible import RULES, nearer_depth
-from mudg.core.zbuffer import DrawLimits, PointLayer, draw_points
+from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, nearer_depth
 
 Matrix = NDArray[np.float64]
 STATIC: Final = -1
@@ -526,7 +525,7 @@ def fuse_sweeps(
         sweeps: sweeps with the images that may colour them, in any order.
         tracks: all tracked boxes; which of them move is decided here.
         rules: see ``FusionRules``.
-        cameras: maps of the images' colours to common ones (``core/color_match.py``).
+        cameras: maps of the images' colours to common ones (``core/calibration.py``).
 
     Returns:
         The fused cloud (static: world frame; objects: box frame, by track id) and a report. ``semantics`` are None

@@ -1,7 +1,7 @@
 """A row-aligned table of parameters: every column, its two Adam moments and every counter share one row order.
 
 Row operations (``take``, ``append``, ``permute`` as a take) move all of them together, so a moment can never belong to another
-row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``models/scene/model.py``.
+row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``gaussians/model.py``.
 """
 
 from __future__ import annotations

@@ -15,8 +15,9 @@ from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.adapt import PlannedAdaptation
-    from mudg.stages.config import AdaptConfig, FitConfig
+    from mudg.diffusion.adapt import PlannedAdaptation
+    from mudg.diffusion.settings.adapt import AdaptConfig
+    from mudg.gaussians.settings import FitConfig
 
 
 class Adapt(Output):
@@ -49,12 +50,12 @@ class Adapt(Output):
         return replace(self, settings=replace(self.settings, device=str(device)))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.models.mdm.files import folder_of
+        from mudg.diffusion.files import folder_of
 
         return super().reads() | {"model": folder_of(self.settings.model)}
 
     def inputs(self) -> dict[str, str]:
-        from mudg.models.mdm.files import digest
+        from mudg.diffusion.files import digest
 
         return super().inputs() | {"model": digest(self.settings.model)}
 
@@ -62,7 +63,7 @@ class Adapt(Output):
         return {name: value for name, value in super().key_settings().items() if name != "processes"}
 
     def prepare(self, inputs: dict[str, str]) -> PlannedAdaptation:
-        from mudg.stages.adapt import PlannedAdaptation
+        from mudg.diffusion.adapt import PlannedAdaptation
 
         return PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted))
 
@@ -80,7 +81,7 @@ class Adapt(Output):
 
 def fit_scene(settings: FitConfig, scene: Path, fused: Path | None, out: Path) -> None:
     """Fuse a scene, unless it has clouds, and fit it."""
-    from mudg.stages.config import FuseConfig
+    from mudg.scene.settings import FuseConfig
 
     fused = fused or Fuse(scene=scene, out=out / "fuse", settings=FuseConfig()).run()
     Fit(scene=scene, fused=fused, out=out / "fit", settings=settings).run()

@@ -12,7 +12,7 @@ from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.config import AnnotateConfig
+    from mudg.labels.settings import AnnotateConfig
 
 
 class Annotate(Listed):
@@ -32,17 +32,17 @@ class Annotate(Listed):
         return replace(self.settings, processes=1)
 
     def checked(self) -> Self:
-        from mudg.stages.labelling import depth
+        from mudg.labels import annotate as depth
 
         return replace(self, settings=depth.placed(self.settings))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.stages.labelling import depth
+        from mudg.labels import annotate as depth
 
         return super().reads() | depth.folders(self.settings)
 
     def inputs(self) -> dict[str, str]:
-        from mudg.stages.labelling import depth
+        from mudg.labels import annotate as depth
 
         return super().inputs() | depth.digests(self.settings)
 
@@ -50,6 +50,6 @@ class Annotate(Listed):
         return {name: value for name, value in super().key_settings().items() if name != "processes"}  # it changes no result
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages import annotate
+        from mudg.labels import annotate
 
         return annotate.write_labelled(self.settings, cast("Path", self.scene), work)

@@ -12,10 +12,9 @@ from mudg.steps.engine import Result
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.result_file import ResultFile
-    from mudg.base.run_folder import RunDir, VerbOutput
-    from mudg.stages.config import ImportConfig
-    from mudg.stages.editing.runs import RunParts
+    from mudg.base.run_folder import ResultFile, RunDir, VerbOutput
+    from mudg.editing.runs import RunParts
+    from mudg.exporting.settings import ImportConfig
 
 
 class AssetExport(Result):
@@ -45,7 +44,7 @@ class AssetExport(Result):
 
     def run_parts(self) -> RunParts:
         """The fits and the scene of the source."""
-        from mudg.stages.editing.runs import find_run
+        from mudg.editing.runs import find_run
 
         parts = find_run(self.source)
         return replace(parts, scene=self.scene or parts.scene)
@@ -62,7 +61,7 @@ class AssetExport(Result):
         return {"id": self.track_id}
 
     def make(self, work: ResultFile, prepared: Any) -> dict[str, Any]:
-        from mudg.stages.editing import assets
+        from mudg.editing import assets
 
         return assets.write_asset_from(self.run_parts(), self.track_id, work.path)
 
@@ -101,7 +100,7 @@ class AssetImport(Result):
         return VerbOutput("asset", 1, MODEL_FILES)
 
     def checked(self) -> Self:
-        from mudg.stages.exporting import imports
+        from mudg.exporting import imports
 
         imports.refuse_other_settings(self.settings)
         if self.is_file:
@@ -113,12 +112,12 @@ class AssetImport(Result):
         return super().key_settings() | ({"name": self.file.name} if self.is_file else {})
 
     def prepare(self, inputs: dict[str, str]) -> Any:
-        from mudg.stages.exporting import imports
+        from mudg.exporting import imports
 
         return None if self.is_file else imports.read_file(self.file, self.settings)
 
     def make(self, work: ResultFile | RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages.exporting import imports
+        from mudg.exporting import imports
 
         if self.is_file:
             return imports.write_object(self.settings, self.file, work.path)

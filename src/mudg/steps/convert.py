@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.stages.config import ConvertConfig
+    from mudg.diffusion.settings.convert import ConvertConfig
 
 
 class Convert(Step):
@@ -35,6 +35,6 @@ class Convert(Step):
     settings: ConvertConfig
 
     def act(self) -> Path:
-        from mudg.stages import convert
+        from mudg.steps import conversion as convert
 
         return convert.run(self.settings, self.checkpoint, self.to, overwrite=self.overwrite)

@@ -13,9 +13,9 @@ from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.config import EditConfig
-    from mudg.stages.edit import PlannedEdit
-    from mudg.stages.editing.runs import RunParts
+    from mudg.editing.edit import PlannedEdit
+    from mudg.editing.runs import RunParts
+    from mudg.editing.settings import EditConfig
 
 _MODELS = (*MODEL_FILES, *below("fit/*", MODEL_FILES))
 _CLOUDS = ("static.safetensors", "objects/*.safetensors", "fuse.json")
@@ -46,7 +46,7 @@ class Edit(Output):
 
     def run_parts(self) -> RunParts:
         """The fits, scene and clouds that are edited."""
-        from mudg.stages.editing.runs import find_run
+        from mudg.editing.runs import find_run
 
         parts = find_run(self.source)
         return replace(parts, scene=self.scene or parts.scene, fused=self.fused or parts.fused)
@@ -66,7 +66,7 @@ class Edit(Output):
 
     def prepare(self, inputs: dict[str, str]) -> PlannedEdit:
         from mudg.core.raster.place import drawing_device
-        from mudg.stages.edit import PlannedEdit
+        from mudg.editing.edit import PlannedEdit
 
         drawing_device(self.settings.device, "render", self.settings.raster)
         planned = PlannedEdit.of(self.settings, script_of(self.script)[0], self.run_parts())

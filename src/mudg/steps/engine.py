@@ -12,7 +12,7 @@ from mudg.steps.step import Step, flag_of, hint_of
 
 if typing.TYPE_CHECKING:
     from mudg.base.run_folder import RunDir, VerbOutput
-    from mudg.data.edits import EditScript
+    from mudg.editing.script import EditScript
 
 
 class Result(Step):
@@ -100,7 +100,7 @@ class Result(Step):
 
 def fill(step: Result) -> Path:
     """Make the result of a step, or reuse it."""
-    from mudg.base.result_file import ResultFile
+    from mudg.base.run_folder import ResultFile
 
     step = step.checked()
     if step.is_file:
@@ -166,6 +166,6 @@ def is_script(step: Step, name: str) -> bool:
 
 def script_of(path: Path) -> tuple[EditScript, str]:
     """An edit script, and the digest of what it says and of the files that it names."""
-    from mudg.stages.editing.carried import read_and_digest
+    from mudg.editing.carried import read_and_digest
 
     return read_and_digest(path)

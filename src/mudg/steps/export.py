@@ -9,11 +9,10 @@ from mudg.steps.engine import Result, script_of
 from mudg.steps.step import FILE_YAML, RUN, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.result_file import ResultFile
-    from mudg.base.run_folder import RunDir, VerbOutput
-    from mudg.stages.config import ExportConfig
-    from mudg.stages.editing.runs import RunParts
-    from mudg.stages.exporting.export import Exported
+    from mudg.base.run_folder import ResultFile, RunDir, VerbOutput
+    from mudg.editing.runs import RunParts
+    from mudg.exporting.export import Exported
+    from mudg.exporting.settings import ExportConfig
 
 
 class Export(Result):
@@ -50,24 +49,24 @@ class Export(Result):
 
     def output(self) -> VerbOutput:
         from mudg.base.run_folder import VerbOutput
-        from mudg.stages.exporting.export import FOLDERS
+        from mudg.exporting.export import FOLDERS
 
         return VerbOutput("export", *FOLDERS[self.format])
 
     @property
     def is_file(self) -> bool:
-        from mudg.stages.exporting.export import FOLDERS
+        from mudg.exporting.export import FOLDERS
 
         return self.format not in FOLDERS
 
     def run_parts(self) -> RunParts:
         """The fits, scene and clouds that are exported."""
-        from mudg.stages.exporting.export import parts_of
+        from mudg.exporting.export import parts_of
 
         return parts_of(self.format, self.source, self.scene)
 
     def checked(self) -> Self:
-        from mudg.stages.exporting import export
+        from mudg.exporting import export
 
         export.check(self.settings, self.format, self.out)
         return self
@@ -84,12 +83,12 @@ class Export(Result):
         return super().key_settings() | {"format": self.format}
 
     def prepare(self, inputs: dict[str, str]) -> Exported:
-        from mudg.stages.exporting.export import Exported
+        from mudg.exporting.export import Exported
 
         return Exported.of(self.run_parts(), None if self.edits is None else script_of(self.edits)[0])
 
     def make(self, work: ResultFile | RunDir, prepared: Exported) -> dict[str, Any]:
-        from mudg.stages.exporting import export
+        from mudg.exporting import export
 
         if self.is_file:
             return export.write_file(self.settings, self.format, prepared, work.path)

@@ -14,8 +14,8 @@ from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir, VerbOutput
-    from mudg.stages.config import FitConfig
-    from mudg.stages.fit import FitInputs
+    from mudg.gaussians.fit import FitInputs
+    from mudg.gaussians.settings import FitConfig
 
 
 class Fit(Output):
@@ -49,13 +49,13 @@ class Fit(Output):
     @property
     def reads_scene_alone(self) -> bool:
         """Whether the method has no Gaussians: it starts from no clouds."""
-        from mudg.methods import METHODS
+        from mudg.gaussians.methods import METHODS
 
         return METHODS[self.settings.method].scene == "radiance"
 
     def output(self) -> VerbOutput:
         """Methods without boxes fuse the clouds again; results of those that took the ones of `mudg fuse` are made again."""
-        from mudg.methods import METHODS
+        from mudg.gaussians.methods import METHODS
 
         own = super().output()
         return own if self.reads_scene_alone or METHODS[self.settings.method].boxes else replace(own, version=own.version + 1)
@@ -65,7 +65,7 @@ class Fit(Output):
             if self.start_from is not None:
                 raise UsageError(f"{self.settings.method} cannot go on with a finished fit", remedy="leave --start-from out")
             return self
-        from mudg.stages import fit
+        from mudg.gaussians import fit
 
         given = (self.fused is not None, bool(self.observations), self.start_from is not None)
         fit.check(self.settings, fused=given[0], virtual=given[1], continued=given[2])
@@ -88,9 +88,9 @@ class Fit(Output):
 
             choose_device(self.settings.device, "fit")
             return None
-        from mudg.stages import fit
-        from mudg.stages.fitting.continued import StartFit
-        from mudg.stages.fitting.views import virtual_sets
+        from mudg.gaussians import fit
+        from mudg.gaussians.storage import StartFit
+        from mudg.gaussians.views import virtual_sets
 
         virtual, begun = {}, None if self.start_from is None else StartFit.of_folder(self.start_from, inputs)
         inputs |= {} if begun is None else {"start": begun.digest}
@@ -104,10 +104,10 @@ class Fit(Output):
     def make(self, work: RunDir, prepared: FitInputs | None) -> dict[str, Any]:
         if prepared is None:
             from mudg.base.devices import choose_device
-            from mudg.data.scene import read_scene
-            from mudg.stages.radiance.loop import fit_radiance
+            from mudg.baselines.emernerf.fit import fit_radiance
+            from mudg.scene.read import read_scene
 
             return fit_radiance(self.settings, read_scene(self.scene), work, choose_device(self.settings.device, "fit"))
-        from mudg.stages import fit
+        from mudg.gaussians import fit
 
         return fit.write_fit(self.settings, prepared, work)

@@ -11,7 +11,7 @@ from mudg.steps.step import Flag
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
     from mudg.base.types import Scene
-    from mudg.stages.config import FuseConfig
+    from mudg.scene.settings import FuseConfig
 
 
 class Fuse(Listed):
@@ -27,14 +27,14 @@ class Fuse(Listed):
     settings: FuseConfig
 
     def prepare(self, inputs: dict[str, str]) -> Scene:
-        from mudg.data.scene import read_scene
-        from mudg.stages import fuse
+        from mudg.scene import fuse
+        from mudg.scene.read import read_scene
 
         scene = read_scene(cast("Path", self.scene))
         fuse.refuse_without_lidar(scene)
         return scene
 
     def make(self, work: RunDir, prepared: Scene) -> dict[str, Any]:
-        from mudg.stages import fuse
+        from mudg.scene import fuse
 
         return fuse.write_fusion(prepared, self.settings, work.path)

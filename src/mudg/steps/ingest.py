@@ -15,7 +15,7 @@ from mudg.steps.step import Flag, usage
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.config import IngestConfig
+    from mudg.formats.settings import IngestConfig
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
 OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
@@ -69,23 +69,23 @@ class Ingest(Listed):
     @functools.cached_property
     def kind(self) -> str:
         """What the log is: a format, ``city`` or ``scene``."""
-        from mudg.stages import ingest
+        from mudg.formats import ingest
 
         return ingest.kind_of(self.settings, Path(self.log))
 
     def checked(self) -> Self:
-        from mudg.stages import ingest
+        from mudg.formats import ingest
 
         return replace(self, overwrite=self.overwrite or ingest.is_abandoned(self.out))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.stages import ingest
+        from mudg.formats import ingest
 
         named = {"log": "" if self.log == "city" else self.log, "poses": self.settings.poses, "boxes": self.settings.boxes}
         return named | ingest.files_read(self.settings, Path(self.log), self.kind)
 
     def inputs(self) -> dict[str, str]:
-        from mudg.stages import ingest
+        from mudg.formats import ingest
 
         return {} if self.kind == "city" else {"source": ingest.source_digest(Path(self.log), self.kind, self.settings)}
 
@@ -94,6 +94,6 @@ class Ingest(Listed):
         return {name: value for name, value in super().key_settings().items() if name not in idle}
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages import ingest
+        from mudg.formats import ingest
 
         return ingest.write_scene(self.settings, Path(self.log), self.kind, work)

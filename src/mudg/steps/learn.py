@@ -10,7 +10,7 @@ from mudg.steps.engine import opened
 from mudg.steps.outputs import Output
 
 if TYPE_CHECKING:
-    from mudg.stages.config import LearnConfig
+    from mudg.diffusion.settings.learn import LearnConfig
 
 
 class Learn(Output):
@@ -34,24 +34,24 @@ class Learn(Output):
     settings: LearnConfig
 
     def act(self) -> Path:
-        from mudg.stages import learn
+        from mudg.diffusion import learn
 
         step = self.checked()
         learn.train(step.settings, step.out, step.output(), lambda: opened(step)[1])
         return self.out / "model"
 
     def checked(self) -> Self:
-        from mudg.stages import learn
+        from mudg.diffusion import learn
 
         return replace(self, settings=learn.check(self.settings))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.stages import learn
+        from mudg.diffusion import learn
 
         return learn.files_read(self.settings, self.out, self.overwrite)
 
     def inputs(self) -> dict[str, str]:
-        from mudg.stages import learn
+        from mudg.diffusion import learn
 
         return learn.inputs_of(self.settings)
 

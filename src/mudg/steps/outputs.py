@@ -47,8 +47,8 @@ class Listed(Output):
             raise UsageError("give a source or a list, not both", got=f"{source} and --list {self.list}")
         if self.list is None:
             return super().act()
-        from mudg.stages.batches.listed import ListedRun, run_listed
-        from mudg.stages.batches.plan import read_list
+        from mudg.fleet.listed import ListedRun, run_listed
+        from mudg.fleet.plan import read_list
 
         one = type(self).build({positions(type(self))[0]: "{source}", "out": self.out, "overwrite": self.overwrite})
         entries = read_list(self.list, self.of_a_line)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from mudg.steps.step import RUN, Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.stages.config import PageConfig
+    from mudg.viewer.settings import PageConfig
 
 
 class Page(Step):
@@ -33,6 +33,6 @@ class Page(Step):
     settings: PageConfig
 
     def act(self) -> dict[str, Any]:
-        from mudg.stages.viewing import view
+        from mudg.viewer import view
 
         return view.run_page(self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite)

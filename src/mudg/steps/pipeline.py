@@ -14,13 +14,12 @@ from typing import Any
 from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, IntegrityError, MudgError, UsageError, similar_path
-from mudg.base.memory import in_words
+from mudg.base.memory import Meter, Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
-from mudg.base.usage import Meter, Usage, folder_bytes
 from mudg.base.versions import environment, version
-from mudg.stages.config import FitConfig, RunConfig, SynthesizeConfig, with_device
-from mudg.stages.config.presets import NO_MODEL, PRESETS
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.steps.adapt import Adapt
 from mudg.steps.annotate import Annotate
 from mudg.steps.fit import Fit
@@ -29,6 +28,8 @@ from mudg.steps.ingest import Ingest
 from mudg.steps.outputs import Output
 from mudg.steps.render import RenderViews
 from mudg.steps.score import Score
+from mudg.steps.settings.presets import NO_MODEL, PRESETS
+from mudg.steps.settings.run import RunConfig, with_device
 from mudg.steps.synthesize import Synthesize
 
 CITY = "city"
@@ -83,7 +84,7 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
 def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: bool) -> dict[str, Any]:
     """The chain, alone in its folder."""
-    from mudg.pages import run_report
+    from mudg.viewer import report as run_report
 
     ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
     config = with_device(config)
@@ -114,10 +115,10 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
 
 def _write_viewer(out: Path) -> Path:
     """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside it."""
-    from mudg.base.result_file import description_path
-    from mudg.pages.run_report import VIEWER
-    from mudg.stages.config import PageConfig
-    from mudg.stages.viewing import view
+    from mudg.base.run_folder import description_path
+    from mudg.viewer import view
+    from mudg.viewer.report import VIEWER
+    from mudg.viewer.settings import PageConfig
 
     page = view.page_of(PageConfig(), view.find_shown(PageConfig(), out, None, None), report="report.html")
     store.remove(description_path(out / VIEWER))
@@ -131,8 +132,8 @@ def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--s
     Args:
         flag: what names the diffusion model on this command line.
     """
-    from mudg.models.mdm.files import read_description
-    from mudg.models.published.files import is_published
+    from mudg.diffusion.files import read_description
+    from mudg.diffusion.published.model import is_published
 
     if generator.model == NO_MODEL:
         raise UsageError(
@@ -153,7 +154,7 @@ def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--s
 def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
     """UsageError where the chain would write into, over or around what it reads. Its own scene is no such case: with a scene as
     source it writes none."""
-    from mudg.models.mdm.files import folder_of
+    from mudg.diffusion.files import folder_of
 
     refuse_overlap(out, {
         "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
@@ -194,9 +195,9 @@ def _forecast(config: RunConfig, scene: Path) -> str:
     from mudg import native
     from mudg.base import devices
     from mudg.core.raster import probe
-    from mudg.data.scene import read_scene
-    from mudg.stages.config import cost
-    from mudg.stages.doctor import scene_size
+    from mudg.scene.read import read_scene
+    from mudg.steps.diagnosis import scene_size
+    from mudg.steps.settings import cost
 
     size, cores, speed = scene_size(read_scene(scene), config), native.default_threads(), probe.speed()
     kind = "cpu" if config.device == "cpu" or devices.usual_device() == "cpu" else "cuda"
@@ -206,8 +207,8 @@ def _forecast(config: RunConfig, scene: Path) -> str:
 
 def _has_semantics(scene: Path) -> bool:
     """Whether every frame has semantic labels. InputError without LiDAR: the chain could not go on after annotate."""
-    from mudg.data.scene import read_scene
-    from mudg.stages import fuse
+    from mudg.scene import fuse
+    from mudg.scene.read import read_scene
 
     loaded = read_scene(scene)
     fuse.refuse_without_lidar(loaded)
@@ -228,7 +229,7 @@ def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
     Raises:
         UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
     """
-    from mudg.models.mdm.files import uses_renders
+    from mudg.diffusion.files import uses_renders
 
     renders = uses_renders(config.synthesize.model)
     if config.adaptation == "off" or (config.adaptation == "auto" and not renders):
@@ -246,8 +247,8 @@ def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
 
 def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
     """Whether a scene is a generated city, and why the diffusion model cannot be adapted to it (empty: it can)."""
-    from mudg.data.scene import read_scene
-    from mudg.stages.adapting.clips import why_not
+    from mudg.diffusion.adapt import why_not
+    from mudg.scene.read import read_scene
 
     loaded = read_scene(scene)
     return loaded.source.recipe is not None, why_not(loaded, replace(config.adapt, cameras=config.synthesize.cameras))
@@ -289,7 +290,7 @@ def _digests(out: Path) -> dict[str, str]:
 
 
 def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
-    from mudg.stages import score
+    from mudg.scoring import score
 
     rows = "\n".join(
         f"  {name:<26}{seconds:8.1f} s{processor_s:11.1f} s{in_words(peak) if peak else '':>12}{in_words(size):>12}"

@@ -13,7 +13,7 @@ from mudg.steps.step import FILE_YAML, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.config import RenderConfig
+    from mudg.editing.view_settings import RenderConfig
 
 
 class RenderViews(Output):
@@ -55,17 +55,17 @@ class RenderViews(Output):
         read = self.digests({"scene": self.scene, "model": self.model, "edits": self.edits})
         if not self.settings.harmonize.on:
             return read
-        from mudg.models.mdm.files import digest
+        from mudg.diffusion.files import digest
 
         return read | self.digests({"fused": self.fused}) | {"diffusion": digest(self.settings.harmonize.model)}
 
     def prepare(self, inputs: dict[str, str]) -> Any:
-        from mudg.stages import render
+        from mudg.editing import render
 
         script = None if self.edits is None else script_of(self.edits)[0]
         return render.prepare(self.settings, self.scene, cast("Path", self.model), script, self.fused)
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages import render
+        from mudg.editing import render
 
         return render.write_views(self.settings, self.scene, cast("Path", self.model), prepared, work.path)

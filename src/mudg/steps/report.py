@@ -22,6 +22,6 @@ class Report(Step):
     """Replace the page if it exists."""
 
     def act(self) -> dict[str, Any]:
-        from mudg.stages.viewing import gallery
+        from mudg.viewer import gallery
 
         return gallery.run(self.runs, self.out, overwrite=self.overwrite)

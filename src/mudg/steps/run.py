@@ -10,7 +10,8 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.stages.config import PresetName, RunConfig
+    from mudg.steps.settings.presets import PresetName
+    from mudg.steps.settings.run import RunConfig
 
 class Run(Output):
     """Run all steps on your own driving log or scene and write a report page."""
@@ -39,7 +40,7 @@ class Run(Output):
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> RunConfig:
         """Preset, then the file, then seed, cameras and shifts, then settings of single steps."""
         from mudg.base import config as configuration
-        from mudg.stages import config as c
+        from mudg.steps import settings as c
 
         made = configuration.load(c.RunConfig, c.run_preset(c.chosen_preset(inputs["preset"], inputs["fast"])), file)
         made = made if inputs["seed"] is None else c.with_seed(made, inputs["seed"])

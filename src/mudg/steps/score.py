@@ -13,7 +13,7 @@ from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.config import ScoreConfig
+    from mudg.editing.view_settings import ScoreConfig
 
 _FILES = ("lpips_weights", "lpips_vgg_weights", "lpips_squeeze_weights", "fid_weights", "fvd_weights", "dino_weights", "clip_weights",
           "video_features", "detections", "lanes")  # fmt: skip
@@ -60,12 +60,12 @@ class Score(Output):
         choose_device(self.settings.device, "networks of the scores")
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages import score
+        from mudg.scoring import score
 
         return score.write_scores(self.settings, self.scene, self.views, work.path, fused=self.fused, truth=self.truth)
 
     def answer(self, outcome: Any) -> dict[str, Any]:
-        from mudg.stages import score
+        from mudg.scoring import score
 
         return {"metrics": outcome / "metrics.json", "text": score.summary_table(outcome)}
 
@@ -87,7 +87,7 @@ class DrawTruth(Output):
         return {"trajectories": [path.name for path in self.trajectories], "views": views}
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages import score_truth
+        from mudg.scoring import truth as score_truth
 
         score_truth.write_truth(self.scene, self.trajectories, work.path)
         return {"trajectories": [path.name for path in self.trajectories]}

@@ -77,7 +77,7 @@ class Step:
 
     def with_parts(self, names: Sequence[str]) -> Self:
         """This step with the parts of runs that these fields mean."""
-        from mudg.stages.editing import runs
+        from mudg.editing import runs
 
         given = {name: getattr(self, name) for name in names}
         found = runs.parts_of({name: path for name, path in given.items() if flag_of(type(self), name).part != "views"}, self.required())
@@ -190,7 +190,7 @@ class _Settings(dict[str, Any]):
     """Names that annotations of steps use and that only type checkers import: classes of settings, looked up when needed."""
 
     def __missing__(self, name: str) -> Any:
-        from mudg.stages import config
+        from mudg.steps import settings as config
 
         try:
             return getattr(config, name)

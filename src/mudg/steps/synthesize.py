@@ -13,7 +13,7 @@ from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.stages.config import SynthesizeConfig
+    from mudg.diffusion.settings.synthesize import SynthesizeConfig
 
 
 class Synthesize(Output):
@@ -53,20 +53,20 @@ class Synthesize(Output):
         return ("fused",)
 
     def checked(self) -> Self:
-        from mudg.stages import synthesize
-        from mudg.stages.learning import loading
+        from mudg.diffusion import views as loading
+        from mudg.steps import synthesis as synthesize
 
         renders = self.fitted is not None
         weather = self.edits is not None and synthesize.shows_weather(self.settings, script_of(self.edits)[0], renders)
         return replace(self, settings=loading.check_config(self.settings, renders, weather=weather))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.models.mdm.files import folder_of
+        from mudg.diffusion.files import folder_of
 
         return super().reads() | {"model": folder_of(self.settings.model)}
 
     def inputs(self) -> dict[str, str]:
-        from mudg.models.mdm.files import digest
+        from mudg.diffusion.files import digest
 
         first = self.digests({"scene": self.scene, "fused": self.fused})
         return first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
@@ -76,13 +76,13 @@ class Synthesize(Output):
         return {name: value for name, value in super().key_settings().items() if name not in ("offload", "compiled")}
 
     def prepare(self, inputs: dict[str, str]) -> Any:
-        from mudg.stages import synthesize
+        from mudg.steps import synthesis as synthesize
 
         script = None if self.edits is None else script_of(self.edits)[0]
         given = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script)
         return given, synthesize.read_drive(self.settings, given)
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.stages import synthesize
+        from mudg.steps import synthesis as synthesize
 
         return synthesize.write_views(self.settings, *prepared, work.path)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from mudg.steps.step import FILE_YAML, RUN, Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.stages.config import ViewConfig
+    from mudg.viewer.settings import ViewConfig
 
 
 class ViewScene(Step):
@@ -35,7 +35,8 @@ class ViewScene(Step):
         return "view"
 
     def act(self) -> dict[str, Any]:
-        from mudg.stages.viewing import edits, view
+        from mudg.viewer import live as edits
+        from mudg.viewer import view
 
         files = edits.EditFiles(self.edits, self.edits_out, self.overwrite)
         return view.run_view(self.settings, self.source, self.compare, scene=self.scene, files=files)

@@ -1,4 +1,4 @@
-// From the bytes of the page to what is drawn: files, sections of their blobs (pages/viewer/packed.py says what they hold), and of the
+// From the bytes of the page to what is drawn: files, sections of their blobs (viewer/page.py says what they hold), and of the
 // Gaussians of a chunk the words of a layer of the data texture. The sorter's worker runs `unpacked`, so that the page does not wait.
 
 import { PoseKeys } from "mudg/math";

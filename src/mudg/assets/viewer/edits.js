@@ -1,5 +1,5 @@
 // What edit scripts do to the paths of objects, as far as the page can show it by itself: remove, move, stop. The rules, and their order
-// of operations, are those of the program (core/edit.py, core/ground.py), so that the page shows what `mudg render --edits` draws.
+// of operations, are those of the program (core/edit.py, core/edit.py), so that the page shows what `mudg render --edits` draws.
 
 import { PoseKeys, add, clamp, cross, dot, keysAround, quaternionOf, rotationOf, sub, turn, unit } from "mudg/math";
 

@@ -1,4 +1,4 @@
-// Falling rain and snow near the camera, as core/weather/particles.py defines them: particles of one size stand still in a frame that falls
+// Falling rain and snow near the camera, as core/weather/air.py defines them: particles of one size stand still in a frame that falls
 // with them; a hash of a cell of that frame says how many it holds and where. So the page shows the drops and flakes of an exact frame.
 
 import { add, dot, sub } from "mudg/math";

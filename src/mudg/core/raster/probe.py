@@ -15,7 +15,7 @@ from mudg.core.raster.rasterize import RasterConfig, rasterize
 
 GAUSSIANS, WIDTH, HEIGHT = 20_000, 240, 160
 REFERENCE_S: Final = 0.0108
-"""Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `stages/config/cost.py` was measured."""
+"""Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `steps/settings/cost.py` was measured."""
 
 
 def scene() -> tuple[Gaussians, View]:

@@ -26,7 +26,8 @@ from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Gaussians, Render, View
 from mudg.core.raster import cpu as raster_cpu
-from mudg.core.raster import gsplat_cuda, gsplat_package, torch_twin
+from mudg.core.raster import gsplat_cuda, torch_twin
+from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster.request import Request
 
 Backend = Literal["auto", "cpu", "torch", "gsplat"]

@@ -1,7 +1,6 @@
 """Weather and light as pure functions of a G-buffer, in linear light. Models, sources and assumptions: docs/weather.md."""
 
-from mudg.core.weather.apply import Weathered, apply
-from mudg.core.weather.drive import DriveFacts, ShownView, drive_facts, edited_view
+from mudg.core.weather.apply import DriveFacts, ShownView, Weathered, apply, drive_facts, edited_view
 from mudg.core.weather.gbuffer import (
     BufferRules,
     GBuffer,
@@ -12,7 +11,7 @@ from mudg.core.weather.gbuffer import (
     mirror_view,
     sun_visibility,
 )
-from mudg.core.weather.tone import FilmicResponse, ToneCurve, curve_of
+from mudg.core.weather.light import FilmicResponse, ToneCurve, curve_of
 
 __all__ = [
     "BufferRules", "DriveFacts", "FilmicResponse", "GBuffer", "OccluderMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply",

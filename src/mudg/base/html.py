@@ -1,0 +1,155 @@
+"""Pages and model cards from the Jinja templates of ``assets/templates``. On pages every value is escaped; CSS and scripts lie inside."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from mudg.base import palette
+
+# tables ---------------------------------------------------------------------------------------------------------------
+#
+# Tables of text as Markdown, LaTeX and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML. No torch.
+
+
+PUBLISHED: Final = "published"
+"""Kind of the lines that LaTeX sets apart from the others by a rule."""
+_LATEX: Final = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TextCell:
+    """A cell: ``best``, the best number of its column; ``reason``, why there is no number."""
+
+    text: str
+    best: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class TextLine:
+    """A line of a table: its title and its cells. ``kind`` is its class on pages."""
+
+    title: str
+    cells: tuple[TextCell, ...]
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table: headings, the first above the titles of the lines; ``title`` above it, on pages and in LaTeX."""
+
+    heads: tuple[str, ...]
+    lines: tuple[TextLine, ...]
+    title: str = ""
+
+    @classmethod
+    def of_texts(cls, heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> TextTable:
+        """A table of plain texts; the first of every row is its title."""
+        return cls(tuple(heads), tuple(TextLine(row[0], tuple(map(TextCell, row[1:]))) for row in rows), title)
+
+
+def markdown(table: TextTable) -> list[str]:
+    """Lines of a Markdown table; the best numbers are bold."""
+    rows = [(line.title, *(f"**{cell.text}**" if cell.best else cell.text for cell in line.cells)) for line in table.lines]
+    first, *others = ("| " + " | ".join(cells) + " |" for cells in (table.heads, *rows))
+    return [first, "|---" * len(table.heads) + "|", *others]
+
+
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table of plain texts."""
+    return markdown(TextTable.of_texts(heads, rows))
+
+
+def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
+    """Values of a row by the format of each; ``-``: there is no such number."""
+    return ["-" if row[key] is None else form.format(row[key]) for key, form in forms.items()]
+
+
+def latex(table: TextTable) -> list[str]:
+    """Lines of a LaTeX ``tabular``; reasons behind cells without a number (--) are comments above it."""
+    heads = table.heads[1:]
+    reasons = dict.fromkeys(f"{h}: {c.reason}" for line in table.lines for h, c in zip(heads, line.cells, strict=True) if c.reason)
+    lines = [*([f"% {table.title}"] if table.title else []), *(f"% -- {reason}" for reason in reasons)]
+    lines += [r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline", " & ".join(map(escaped, table.heads)) + r" \\", r"\hline"]
+    kind = ""
+    for line in table.lines:
+        if kind and PUBLISHED in (kind, line.kind) and kind != line.kind:
+            lines.append(r"\hline")
+        kind = line.kind
+        texts = ("--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in line.cells)
+        lines.append(" & ".join([escaped(line.title), *texts]) + r" \\")
+    return [*lines, r"\hline", r"\end{tabular}"]
+
+
+def escaped(text: str) -> str:
+    """Text with LaTeX's own characters written out."""
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+def csv_text(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Rows of values as CSV."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([heads, *rows])
+    return out.getvalue()
+
+
+def best_of(better: str, numbers: Mapping[str, float]) -> list[str]:
+    """Names of the best of the numbers as they are shown; none where there are fewer than two.
+
+    Args:
+        better: ``higher``, ``lower``, or ``one``: those near 1.
+    """
+    apart = {name: {"higher": -number, "one": abs(number - 1)}.get(better, number) for name, number in numbers.items()}
+    return [name for name, number in apart.items() if number == min(apart.values())] if len(apart) > 1 else []
+
+
+# html -----------------------------------------------------------------------------------------------------------------
+
+
+TONES: Final = ("truth", "nearest_fill", "street_gaussians", "mudg_r", "mudg_s")
+"""Methods that have a colour of their own in ``page.css``."""
+
+
+def render(template: str, **values: Any) -> str:
+    """The text of a page.
+
+    Args:
+        template: file name in ``assets/templates``. values: what the template names; one that is missing is an error.
+    """
+    return _environment().get_template(template).render(**values)
+
+
+def render_text(template: str, **values: Any) -> str:
+    """The text of a Markdown file, where nothing is escaped; arguments as for ``render``."""
+    return _environment().overlay(autoescape=False).get_template(template).render(**values) + "\n"
+
+
+def class_legend() -> list[tuple[str, str]]:
+    """Name and CSS colour of every class."""
+    return [
+        (name, f"rgb({r},{g},{b})")
+        for name, (r, g, b) in zip(palette.CLASSES, palette.DISPLAY_COLORS.tolist(), strict=False)
+    ]
+
+
+@functools.cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("mudg", "assets/templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["tone"] = lambda method: method if method in TONES else "soft"
+    return environment

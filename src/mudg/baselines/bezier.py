@@ -1,0 +1,291 @@
+"""The fit of ``bezier``: BezierGS (Ma et al. 2025), tracked objects on learnt Bezier curves.
+
+Published, and here: the curves of ``baselines/bezier.py`` with their learning rates, and the losses and weights below. The loss of
+curves that agree is our reading of it: a Gaussian keeps its distance from the centre of its object. Left out: the velocity of
+the background, which here has no curves. Everything else is ``street_gaussians``.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Final, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import seeds
+from mudg.base.palette import DYNAMIC_IDS
+from mudg.base.types import FusedCloud, Scene
+from mudg.core import losses, native_ops
+from mudg.core.raster.rasterize import rasterize
+from mudg.core.table import Table
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import NodeRows, RigidNode
+from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, OwnRecipe
+from mudg.gaussians.rendering import boxes_in_view, objects_only
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.start import start_model
+from mudg.gaussians.views import StoredView
+
+# bezier ---------------------------------------------------------------------------------------------------------------
+#
+# Tracked objects whose Gaussians follow Bezier curves (BezierGS, Ma et al. 2025).
+#
+# The box track of an object becomes a cubic curve of its centre, whose four control points are learnt on; every Gaussian has a curve of
+# its own about it, given by four offsets. At a time, ``tau`` the parameter that belongs to it,
+#
+#     mean(t) = B(tau) (trajectory) + B(tau) (offsets),    offsets = turned place in the box + learnt deviation
+#
+# ``B`` are the four Bernstein polynomials. The turned place is a curve too: the one closest to what the rotations of the boxes
+# make of the place. Gaussians themselves turn with the boxes.
+#
+# Column: ``curve`` [N, 4, 3] metres in the world, the deviations; 0 and unused for the background.
+
+
+ROUNDS: Final = 100
+"""Rounds of fitting control points and moving every key to the nearest parameter of the curve."""
+DEGREE: Final = 3
+
+Array = NDArray[np.float64]
+
+
+def bernstein(tau: Array) -> Array:
+    """The four cubic Bernstein polynomials at parameters [K]: f64[K, 4]."""
+    u = np.asarray(tau, np.float64)[..., None]
+    return np.concatenate([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class BezierPath:
+    """A cubic curve and the parameter that belongs to a time.
+
+    Args:
+        control: f64[4, 3] metres. clock: coefficients of the cubic in time, highest power first. middle_s, span_s: time that it is a
+            polynomial in, ``(t - middle) / span``.
+        tau: parameters of the keys, f64[K]. error_m: root mean square distance of the curve from the keys at their times.
+    """
+
+    control: Array
+    clock: Array
+    middle_s: float
+    span_s: float
+    tau: Array
+    error_m: float
+
+    def tau_at(self, time_s: float | Array) -> Array:
+        """Parameters of times."""
+        return np.polyval(self.clock, (np.asarray(time_s, np.float64) - self.middle_s) / self.span_s)
+
+    def at(self, time_s: float | Array) -> Array:
+        """Positions [..., 3] at times."""
+        return bernstein(self.tau_at(time_s)) @ self.control
+
+
+def fit_path(times_s: Array, positions: Array) -> BezierPath:
+    """The curve of a track: from parameters along the chord, and from such in proportion to the time; the better one.
+
+    Args:
+        times_s: f64[K], rising. positions: f64[K, 3] metres.
+    """
+    times = np.asarray(times_s, np.float64)
+    span = max(float(times[-1] - times[0]), 1e-6)
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    even = (times - times[0]) / span
+    chord = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum() if steps.sum() > 1e-3 else even
+    middle = float(times[0] + times[-1]) / 2
+    paths = [_refined(times, positions, start, middle, span) for start in (even, chord)]
+    return min(paths, key=lambda path: path.error_m)
+
+
+def _refined(times: Array, positions: Array, tau: Array, middle: float, span: float) -> BezierPath:
+    for _ in range(ROUNDS):
+        control = control_points(tau, positions)
+        nearer = _nearest(control, positions, tau)
+        settled = np.abs(nearer - tau).max() < 1e-12
+        tau = nearer
+        if settled:
+            break
+    control = control_points(tau, positions)
+    degree = min(DEGREE, len(times) - 1)
+    clock = np.polyfit((times - middle) / span, tau, degree)
+    path = BezierPath(control, clock, middle, span, tau, 0.0)
+    return replace(path, error_m=float(np.sqrt(((path.at(times) - positions) ** 2).sum(1).mean())))
+
+
+def control_points(tau: Array, values: Array) -> Array:
+    """The four control points [4, c] whose curve comes closest to values [K, c] at parameters [K]; with fewer than four keys, those
+    nearest to a straight line."""
+    line = values[0] + np.linspace(0, 1, 4)[:, None] * (values[-1] - values[0])
+    basis = bernstein(tau)
+    return line + np.linalg.lstsq(basis, values - basis @ line, rcond=1e-9)[0]
+
+
+def _nearest(control: Array, positions: Array, tau: Array) -> Array:
+    """One step of Newton's method towards the nearest parameters, kept in [0, 1] and where it comes nearer."""
+    first, second = 3 * np.diff(control, axis=0), 6 * np.diff(control, n=2, axis=0)
+    u = tau[:, None]
+    away = bernstein(tau) @ control - positions
+    slope = (1 - u) ** 2 * first[0] + 2 * u * (1 - u) * first[1] + u**2 * first[2]
+    bend = (1 - u) * second[0] + u * second[1]
+    top, below = (away * slope).sum(1), (slope**2 + away * bend).sum(1)
+    moved = np.clip(tau - np.where(below > 1e-9, top / np.maximum(below, 1e-9), 0.0), 0, 1)
+    better = ((bernstein(moved) @ control - positions) ** 2).sum(1) < (away**2).sum(1)
+    return np.where(better, moved, tau)
+
+
+class BezierNode(RigidNode):
+    """A tracked object on curves. Its own table: ``trajectory`` [1, 4, 3] metres, what the centre's control points differ by."""
+
+    kind = "bezier"
+    learnt: Table
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.learnt = Table({"trajectory": torch.zeros(1, 4, 3)})
+        self.path = fit_path(self.times_s, self.world_from_object[:, :3, 3])
+        turns = self.world_from_object[:, :3, :3].reshape(-1, 9)
+        self.turns = control_points(self.path.tau, turns).reshape(4, 3, 3)
+        self._curves: dict[float, tuple[Tensor, Tensor, Tensor]] = {}
+
+    @classmethod
+    def of_rigid(cls, node: RigidNode) -> BezierNode:
+        """The same object on curves; learnt offsets of its boxes are not taken over."""
+        return cls(node.name, node.label, node.size_m, node.times_s, node.world_from_object)
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """See ``StaticNode``."""
+        placement = self._placement(time_s)
+        if placement is None:
+            return None
+        means = self._center(time_s) + self.offsets_at(rows, float(self.path.tau_at(time_s)))
+        return replace(rows, means=means, quats=rows.quats @ placement[2], sh_rest=self._colors_turned(rows.sh_rest, time_s))
+
+    def offsets_at(self, rows: NodeRows, tau: float) -> Tensor:
+        """Where Gaussians are beside the centre of the object at a parameter of the curve, ``[n, 3]`` metres in the world."""
+        weights, turned, _ = self._at(tau)
+        return rows.means.detach() @ turned + torch.einsum("j,njc->nc", weights, rows.own["curve"])
+
+    def _center(self, time_s: float) -> Tensor:
+        weights, _, center = self._at(float(self.path.tau_at(time_s)))
+        return center + (weights[:, None] * self.learnt["trajectory"][0]).sum(0)
+
+    def _at(self, tau: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Weights of the control points [4], what turns places (transposed, [3, 3]) and the track's own centre [3], where the rows
+        are; the last few are remembered."""
+        if tau not in self._curves:
+            if len(self._curves) > 256:
+                self._curves.clear()
+            weights, device = bernstein(np.array(tau)), self.learnt.device
+            parts = (weights, np.einsum("j,jab->ba", weights, self.turns), weights @ self.path.control)
+            self._curves[tau] = tuple(torch.from_numpy(np.array(p)).float().to(device) for p in parts)  # type: ignore[assignment]
+        return self._curves[tau]
+
+    def parameters(self) -> Table:
+        """See ``StaticNode``."""
+        return self.learnt
+
+    def to(self, device: torch.device) -> Self:
+        """See ``StaticNode``."""
+        there = copy.copy(super().to(device))
+        there.learnt, there._curves = self.learnt.to(device), {}
+        return there
+
+    def moved(self, object_from_new: NDArray[np.float64]) -> Self:
+        """See ``RigidNode``; what the curves learnt stays as it is in the world."""
+        made = super().moved(object_from_new)
+        made.learnt = Table({name: value.detach() for name, value in self.learnt.columns.items()})
+        return made
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        facts, tensors = super().state()
+        return facts, tensors | {f"learnt.{name}": value for name, value in self.learnt.state().items()}
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
+        """Inverse of ``state``."""
+        made = super().from_state(facts, tensors)
+        made.learnt = Table.from_state(
+            {key.removeprefix("learnt."): value for key, value in tensors.items() if key.startswith("learnt.")}
+        )
+        return made
+
+
+def distance_change(node: BezierNode, rows: NodeRows, taus: Sequence[float]) -> Tensor:
+    """Sum over Gaussians of how much their distance from the object's centre differs at two parameters, metres."""
+    first, second = (node.offsets_at(rows, tau).square().sum(1).add(1e-12).sqrt() for tau in taus)
+    return (first - second).abs().sum()
+
+
+# bezier ---------------------------------------------------------------------------------------------------------------
+
+
+LIDAR_WEIGHT, LIDAR_DECAY_STEPS = 1.0, 8000.0
+SMOOTH_WEIGHT, OBJECTS_WEIGHT, CONSISTENCY_WEIGHT = 0.1, 0.1, 0.01
+SSIM_SHARE: Final = 0.2
+SKY_M: Final = 900.0 * SCENE_UNIT_M
+
+
+class BezierRecipe(OwnRecipe):
+    """See the module's text."""
+
+    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight",)
+    unfit: ClassVar[tuple[str, ...]] = ("poses.learn", "objects.deformable", "loss.object_weight")
+
+    def start(
+        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+    ) -> SceneModel:
+        """See ``Recipe``."""
+        model = start_model(scene, fused, views, classes, config)
+        columns = {name: value.detach() for name, value in model.table.columns.items()}
+        table = Table(columns | {"curve": torch.zeros(len(model.table), 4, 3)}, model.table.labels)
+        nodes = tuple(BezierNode.of_rigid(node) if isinstance(node, RigidNode) else node for node in model.nodes)
+        return replace(model, table=table, nodes=nodes)
+
+    def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
+        """See ``Recipe``."""
+        render, view = drawn.render, drawn.view
+        inverse = losses.inverse_depth(render.depth, render.alpha, SKY_M) * SCENE_UNIT_M
+        terms = {"smooth": SMOOTH_WEIGHT * losses.edge_aware(inverse, view.rgb)}
+        if view.lidar is not None and len(view.lidar.pixel):
+            weight = LIDAR_WEIGHT * math.exp(-drawn.published_step / LIDAR_DECAY_STEPS)
+            terms["lidar"] = weight * losses.sparse_inverse_depth(
+                inverse, view.lidar.pixel, view.lidar.depth_m / SCENE_UNIT_M
+            )
+        if len(drawn.model.nodes) > 1:
+            if view.channels is not None:
+                terms["objects"] = OBJECTS_WEIGHT * objects_alone(drawn, view.channels)
+            terms["consistency"] = CONSISTENCY_WEIGHT * consistency(drawn)
+        return terms
+
+
+def objects_alone(drawn: DrawnView, channels: Tensor) -> Tensor:
+    """Colour of the objects by themselves and the difference of their opacity from the mask: pixels of a dynamic class in a box."""
+    model, view = drawn.model, drawn.view
+    number_of = [channel for channel, train_id in enumerate(model.classes) if train_id in DYNAMIC_IDS]
+    mask = boxes_in_view(model, view.view).to(channels.device, non_blocking=True)
+    mask = mask & torch.isin(channels, torch.tensor(number_of).to(channels.device))[None] & view.mask
+    alone = rasterize(objects_only(drawn.gaussians), view.view, drawn.raster)
+    return native_ops.photometric(alone.rgb, view.rgb * mask, SSIM_SHARE) + (alone.alpha - mask.float()).abs().mean()
+
+
+def consistency(drawn: DrawnView) -> Tensor:
+    """Mean over the Gaussians of objects of how much their distance from the centre, at the time of the view, differs from that at
+    another time (drawn from seed and step)."""
+    model, time_s = drawn.model, drawn.view.view.time_s
+    table, counts = model.table, model.counts()
+    other = float(seeds.numpy_rng(drawn.config.seed, drawn.step, "other time").random())
+    total, rows = table["curve"].new_zeros(()), 0
+    starts = np.cumsum([0, *counts])
+    for node, start, count in zip(model.nodes, starts, counts):
+        if isinstance(node, BezierNode) and count and node.keys_around(time_s) is not None:
+            part = slice(int(start), int(start) + count)
+            given = NodeRows(table["means"][part], table["quats"][part], table["logits"][part], table["sh_dc"][part],
+                             {"curve": table["curve"][part]})  # fmt: skip
+            total, rows = total + distance_change(node, given, (float(node.path.tau_at(time_s)), other)), rows + count
+    return total / max(1, rows)

@@ -1,0 +1,1 @@
+"""EmerNeRF, a radiance field of a street that is marched along rays."""

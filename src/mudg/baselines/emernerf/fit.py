@@ -1,0 +1,609 @@
+"""The fit of a radiance field (method emernerf): two batches of rays per step, one of pixels and one of LiDAR, each with its own gradient
+step.
+
+    OUT/model.json, field.safetensors    the field (``fit.py``)
+    OUT/preview/*.png                    truth, colour, depth, what moves, flow
+    OUT/log.jsonl, steps/                how it went; checkpoints, while it runs
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import checkpoint, geometry, log, seeds, store
+from mudg.base.devices import memory_of
+from mudg.base.errors import InputError, NumericsError
+from mudg.base.processes import Interruption, one_torch_thread
+from mudg.base.records import understood
+from mudg.base.run_folder import RunDir
+from mudg.base.types import Frame, Observation, Scene, View
+from mudg.baselines.emernerf.field import (
+    Budget,
+    Extent,
+    FieldSizes,
+    Marched,
+    RadianceField,
+    RayDraws,
+    Rays,
+    Weights,
+    colors,
+    lidar_terms,
+    march,
+    pixel_terms,
+    proposal_loss,
+)
+from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
+from mudg.gaussians.rendering import COVERED
+from mudg.gaussians.settings import FitConfig, RadianceConfig
+from mudg.gaussians.storage import RADIANCE, description_of, kind_of
+from mudg.gaussians.views import StoredView, load_recorded, training_frames
+from mudg.scene.read import read_points
+
+# rays -----------------------------------------------------------------------------------------------------------------
+#
+# What a radiance field learns from: pixels of recorded frames and LiDAR rays, as rays in the world. Tracked boxes are not read.
+
+
+MOST_LIDAR_RAYS = 8_000_000
+NEAREST_RETURN_M = 0.5
+AROUND_CAMERAS_M = 60.0
+ERROR_CELL_PX = 8
+ERROR_KEPT = 0.7
+BOX_PERCENTILES = (2.0, 98.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LidarRays:
+    """M LiDAR measurements: origins and unit directions f32[M, 3], ranges f32[M] in metres, times f32[M] in seconds."""
+
+    origins: Tensor
+    directions: Tensor
+    range_m: Tensor
+    time_s: Tensor
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def batch(self, count: int, extent: Extent, generator: torch.Generator) -> tuple[Rays, Tensor]:
+        """``count`` of them, drawn with replacement, and their ranges."""
+        chosen = torch.randint(0, len(self), (count,), generator=generator)
+        times = ((self.time_s[chosen] - extent.start_s) / extent.span_s).clamp(0, 1)[:, None]
+        rays = Rays(self.origins[chosen], self.directions[chosen], times.float(), torch.zeros(count, dtype=torch.int64))
+        return rays, self.range_m[chosen]
+
+
+def lidar_rays(scene: Scene) -> LidarRays | None:
+    """All returns of all sweeps as rays; None where there are none. Each has its own time and, along the vehicle's path, its own origin."""
+    share = 1.0
+    parts: list[tuple[np.ndarray, ...]] = []
+    for sweep in log.progress(scene.sweeps, len(scene.sweeps), "reading LiDAR rays"):
+        points = read_points(scene, sweep)
+        share = min(share, MOST_LIDAR_RAYS / max(1, len(points.xyz) * len(scene.sweeps)))
+        kept = slice(None, None, max(1, round(1 / share)))
+        world = geometry.transform_points(sweep.world_from_lidar, points.xyz[kept]).astype(np.float64)
+        time_s = sweep.time_s + points.dt_s[kept].astype(np.float64)
+        path, keys = scene.ego.world_from_ego[:, :3, 3], scene.ego.times_s
+        moved = [
+            np.interp(time_s, keys, path[:, axis]) - np.interp(sweep.time_s, keys, path[:, axis]) for axis in range(3)
+        ]
+        origins = sweep.world_from_lidar[:3, 3] + np.stack(moved, -1)
+        along = world - origins
+        far = np.linalg.norm(along, axis=1)
+        good = far > NEAREST_RETURN_M
+        parts.append((origins[good], along[good] / far[good, None], far[good], time_s[good]))
+    if not sum(len(part[0]) for part in parts):
+        return None
+    columns = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts))
+    origins, directions, range_m, time_s = columns
+    return LidarRays(origins.float(), directions.float(), range_m.float(), time_s)
+
+
+def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
+    """The box of the LiDAR points (without the outermost 2 % along every axis), and the time of the log."""
+    if lidar is None:
+        places = np.stack([frame.view.center_world for frame in scene.frames])
+        low, high = places.min(0) - AROUND_CAMERAS_M, places.max(0) + AROUND_CAMERAS_M
+        log.warn(
+            f"no LiDAR: the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras, and nothing measures distance"
+        )
+    else:
+        points = (lidar.origins + lidar.range_m[:, None] * lidar.directions).numpy()
+        low, high = np.percentile(points, BOX_PERCENTILES, axis=0)
+    center, half = (low + high) / 2, np.maximum((high - low) / 2, 1.0)
+    times = np.array(sorted({frame.view.time_s for frame in scene.frames}))
+    own = np.array([frame.view.time_s for frame in scene.frames_of(scene.frames[0].view.camera.name)])
+    gaps = np.diff(np.sort(own))
+    start, end = times.min(), times.max()
+    step = float(np.median(gaps)) if len(gaps) else 0.1
+    return Extent(tuple(center.tolist()), tuple(half.tolist()), float(start), float(max(end - start, step)), step)
+
+
+def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple[Rays, Tensor]:
+    """A ray for every (``stride``-th) pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
+    x, y = (torch.from_numpy(values[::stride].astype(np.float32)) for values in geometry.pixel_rays(view.camera))
+    plane = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x)), torch.ones(len(y), len(x))], -1).reshape(
+        -1, 3
+    )
+    return _rays(plane, torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4),
+                 torch.full((len(plane), 1), extent.normalised(view.time_s)),
+                 torch.full((len(plane),), camera, dtype=torch.int64)), 1 / plane.norm(dim=1)  # fmt: skip
+
+
+def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> Rays:
+    along = (poses[:, :3, :3] * plane[:, None, :]).sum(2)
+    return Rays(poses[:, :3, 3], along / along.norm(dim=1, keepdim=True), times, cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelBatch:
+    """Rays of pixels with what they show: colours f32[R, 3], whether they count f32[R], sky bool[R] or None; cells of the error map."""
+
+    rays: Rays
+    rgb: Tensor
+    counts: Tensor
+    sky: Tensor | None
+    cells: Tensor
+
+
+class Pixels:
+    """All pixels of the recorded views, and how badly they are met so far.
+
+    Args:
+        views: recorded; each needs an image.
+        cameras: names; a ray carries the number of its camera.
+    """
+
+    def __init__(self, views: Sequence[StoredView], cameras: Sequence[str], extent: Extent) -> None:
+        sizes = [view.rgb.shape[:2] for view in views]
+        self._starts = torch.tensor([0, *np.cumsum([h * w for h, w in sizes])])
+        self._sizes = torch.tensor(sizes)
+        cells = (self._sizes + ERROR_CELL_PX - 1) // ERROR_CELL_PX
+        self._cells = cells
+        self._cell_starts = torch.cat([torch.zeros(1, dtype=torch.int64), cells.prod(1).cumsum(0)])
+        self.errors = torch.ones(int(self._cell_starts[-1]))
+        self._rgb = torch.from_numpy(np.concatenate([view.rgb.reshape(-1, 3) for view in views]))
+        masks = [np.ones(s, bool) if view.mask is None else view.mask for view, s in zip(views, sizes)]
+        self._counts = torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks]))
+        skies = [view.sky for view in views]
+        known = all(sky is not None for sky in skies)
+        self._sky = (
+            torch.from_numpy(np.concatenate([np.asarray(sky, bool).reshape(-1) for sky in skies])) if known else None
+        )
+        self._poses = torch.from_numpy(np.stack([view.view.world_from_cam for view in views])).float()
+        lenses = [view.view.camera.intrinsics for view in views]
+        self._lenses = torch.tensor(lenses, dtype=torch.float32)
+        self._times = torch.tensor([[extent.normalised(view.view.time_s)] for view in views])
+        self._cameras = torch.tensor([cameras.index(view.view.camera.name) for view in views])
+
+    @property
+    def sky_known(self) -> bool:
+        """Whether all views say where the sky is."""
+        return self._sky is not None
+
+    def batch(self, count: int, error_share: float, generator: torch.Generator) -> PixelBatch:
+        """``count`` pixels, a share of them drawn where the error was large."""
+        guided = round(count * error_share)
+        draws = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+        even = (draws[guided:, 0] * float(self._starts[-1])).long()
+        view = torch.searchsorted(self._starts, even, right=True) - 1
+        inside = even - self._starts[view]
+        width = self._sizes[view, 1]
+        row, column = inside // width, inside % width
+        if guided:
+            found = self._badly_met(draws[:guided])
+            view, row, column = (torch.cat(pair) for pair in zip(found, (view, row, column)))
+        pixel = self._starts[view] + row * self._sizes[view, 1] + column
+        cell = self._cell_starts[view] + (row // ERROR_CELL_PX) * self._cells[view, 1] + column // ERROR_CELL_PX
+        fx, fy, cx, cy = self._lenses[view].unbind(1)
+        plane = torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(fx)], 1)
+        rays = _rays(plane, self._poses[view], self._times[view], self._cameras[view])
+        sky = None if self._sky is None else self._sky[pixel]
+        return PixelBatch(rays, self._rgb[pixel].float() / 255, self._counts[pixel].float(), sky, cell)
+
+    def _badly_met(self, draws: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """View, row and column of pixels in cells drawn by their error."""
+        upto = self.errors.double().cumsum(0)
+        cell = torch.searchsorted(upto, draws[:, 0] * upto[-1], right=True).clamp(max=len(upto) - 1)
+        view = torch.searchsorted(self._cell_starts, cell, right=True) - 1
+        inside, across = cell - self._cell_starts[view], self._cells[view, 1]
+        size = self._sizes[view]
+        row = (inside // across * ERROR_CELL_PX + (draws[:, 1] * ERROR_CELL_PX).long()).minimum(size[:, 0] - 1)
+        column = (inside % across * ERROR_CELL_PX + (draws[:, 2] * ERROR_CELL_PX).long()).minimum(size[:, 1] - 1)
+        return view, row, column
+
+    def note(self, cells: Tensor, error: Tensor) -> None:
+        """Take the errors of a batch into the map (a moving average; of several pixels in a cell, the last)."""
+        self.errors[cells] = ERROR_KEPT * self.errors[cells] + (1 - ERROR_KEPT) * error.cpu().sqrt()
+
+
+def recorded_pixels(
+    scene: Scene, frames: Sequence[Frame], width_px: int, cameras: Sequence[str], extent: Extent
+) -> tuple[Pixels, StoredView]:
+    """The pixels of these frames, and the middle view."""
+    places = dict(load_recorded(scene, frames, (), width_px, False))
+    views = [places[index] for index in range(len(frames))]
+    return Pixels(views, cameras, extent), views[len(views) // 2]
+
+
+def batch_generator(seed: int, step: int, purpose: str) -> torch.Generator:
+    """What a batch is drawn with: a function of seed, step and purpose alone."""
+    return seeds.torch_generator(seed, step, f"radiance {purpose}")
+
+
+# views of a radiance field: observations, and pictures of what it has learnt (depth, what moves, flow) ----------------
+
+
+RAYS_AT_ONCE = 2048
+PREVIEW_RAYS = 6000
+FULL_FLOW_M = 1.0
+"""Flow per time step, in metres, that is drawn in full colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of what moves ``[H, W]``;
+    flow to the next time step ``[3, H, W]`` in metres, of what moves."""
+
+    rgb: Tensor
+    depth: Tensor
+    opacity: Tensor
+    moving: Tensor
+    flow: Tensor
+
+
+@torch.no_grad()
+def see(field: RadianceField, view: View, budget: Budget, stride: int = 1) -> Seen:
+    """March all pixels of a view, or every ``stride``-th."""
+    name = view.camera.name
+    rays, z_per_m = view_rays(view, field.extent, field.cameras.index(name) if name in field.cameras else 0, stride)
+    parts = [
+        _part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in range(0, len(rays), RAYS_AT_ONCE)
+    ]
+    width = -(-view.camera.width // stride)
+    every = torch.cat(parts).view(-1, width, 9).permute(2, 0, 1)
+    return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5], every[6:9])
+
+
+def _part(field: RadianceField, rays: Rays, budget: Budget) -> Tensor:
+    rays = rays.to(field.device)
+    marched = march(field, rays, budget)
+    moving = marched.dynamic_weights()
+    flow = (moving[..., None] * marched.values.flow[:, :3].view(*moving.shape, 3)).sum(1)
+    rest = torch.stack([marched.median_m, marched.opacity, moving.sum(1)], 1)
+    return torch.cat([colors(field, rays, marched)[0], rest, flow], 1).cpu()
+
+
+def observe(
+    field: RadianceField, view: View, budget: Budget, source: str = ""
+) -> Observation:
+    """One view as an observation of kind "virtual", without classes; where opacity is below ``COVERED`` there is no depth."""
+    seen = see(field, view, budget)
+    covered = seen.opacity[None] >= COVERED
+    opacity = seen.opacity[None].clamp(0, 1)
+    depth = torch.where(covered, seen.depth[None], torch.nan)
+    mask = torch.ones_like(covered)
+    return Observation(
+        view, seen.rgb.clamp(0, 1), depth, None, torch.where(covered, opacity, 1 - opacity), mask, "virtual", source
+    )
+
+
+def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path: Path, whole: bool = False) -> None:
+    """A picture of five panels: truth, colour, depth, opacity of what moves, its flow. Coarser than the view unless ``whole``."""
+    pixels = stored.view.camera.width * stored.view.camera.height
+    stride = 1 if whole else max(1, round((pixels / PREVIEW_RAYS) ** 0.5))
+    seen = see(field, stored.view, budget, stride)
+    depth = np.where(seen.opacity >= 0.5, seen.depth, np.nan)
+    panels = [
+        stored.rgb[::stride, ::stride],
+        to_bytes(seen.rgb),
+        depth_colors(depth),
+        gray(seen.moving.numpy()),
+        flow_colors(seen.flow.numpy()),
+    ]
+    store.write_image(path, side_by_side(panels))
+
+
+def flow_colors(flow: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Flow ``[3, H, W]`` in metres as a picture: the hue is the direction on the ground, black is at rest, bright one metre or more."""
+    angle = np.arctan2(flow[1], flow[0])
+    strength = np.clip(np.hypot(flow[0], flow[1]) / FULL_FLOW_M, 0, 1)
+    hues = [0.5 + 0.5 * np.cos(angle - turn) for turn in (0.0, 2 * np.pi / 3, 4 * np.pi / 3)]
+    return (255 * np.stack(hues, -1) * strength[..., None]).round().astype(np.uint8)
+
+
+# a fitted radiance field on disk: ``model.json`` of kind radiance, and ``field.safetensors`` --------------------------
+
+
+def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
+    """Field and sampling, without optimiser moments."""
+    store.write_json(
+        folder / "model.json", {"schema": 1, "kind": RADIANCE, **field.description(), "budget": asdict(budget)}
+    )
+    store.write_safetensors(
+        folder / "field.safetensors", {name: value.cpu() for name, value in field.state_dict().items()}
+    )
+
+
+def load_field(folder: Path) -> tuple[RadianceField, Budget]:
+    """Inverse of ``save_field``.
+
+    Raises:
+        InputError: not the folder of a finished fit of a radiance field. IntegrityError: a file was altered.
+    """
+    folder = Path(folder)
+    if kind_of(folder) != RADIANCE:
+        raise InputError(
+            "this folder holds no radiance field", where=str(folder), expected="made by `mudg fit --method emernerf`"
+        )
+    if (folder / store.MANIFEST).is_file():
+        store.verify_manifest(folder)
+    values, tensors = description_of(folder), store.read_tensors(folder / "field.safetensors")
+    with understood("a radiance field", str(folder)):
+        budget = Budget(**{**values["budget"], "proposals": tuple(values["budget"]["proposals"])})
+        return RadianceField.from_state(values, tensors), budget
+
+
+# loop -----------------------------------------------------------------------------------------------------------------
+
+
+WARM_UP = 0.1
+FALLS_AT, FALL = (0.25, 0.5, 0.75, 0.9), 0.33
+RATE, BETAS, EPSILON, WEIGHT_DECAY = 0.01, (0.9, 0.99), 1e-15, 1e-5
+"""Of Adam. The rate rises over the first WARM_UP of the run and falls at the shares FALLS_AT; the decay is added to the gradient."""
+PROPOSALS_EVERY = 5
+"""After the warm-up the proposal networks learn at every n-th step only."""
+ERROR_SHARE = 0.25
+"""Share of the pixels that are drawn where the colour error was large."""
+NEAR_M, FAR_M = 0.1, 1000.0
+"""Distances of the nearest and of the farthest sample."""
+APPEARANCE = 16
+"""Numbers that describe the appearance of a camera."""
+WEIGHTS = Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
+"""Published, but for the dynamic density: 0.01, at once."""
+SIGHT_START, SIGHT_M, SIGHT_LEAST_M, SIGHT_HALVES = 0.08, 6.0, 0.6, 0.2
+"""Share of the run before the line of sight counts; half width of its surface then, and at the end (published: 2.5 m); share of the run in
+which it halves."""
+DYNAMIC_RISE = (0.1, 0.5)
+"""Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that field."""
+LOG_EVERY = 20
+
+
+@dataclass
+class RadianceState:
+    """Everything that changes while fitting, and what it is fitted to."""
+
+    field: RadianceField
+    optimisers: tuple[torch.optim.Adam, torch.optim.Adam]
+    """Of the fields, and of the proposal networks."""
+    pixels: Pixels
+    lidar: LidarRays | None
+    shown: StoredView
+    step: int = 0
+    seconds: float = 0.0
+    last: Mapping[str, float] | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """For run.json."""
+        count = sum(value.numel() for value in self.field.parameters())
+        return {"parameters": count, "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
+
+
+def fit_radiance(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> dict[str, Any]:
+    """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns a summary."""
+    with one_torch_thread(), memory_of(device, "fit"):
+        state = prepare(config, scene, folder, device)
+        optimise(state, config, folder)
+    budget = budget_of(config.radiance)
+    write_preview(state.field, state.shown, budget, folder.path / "preview" / "final.png", whole=True)
+    save_field(state.field, budget, folder.path)
+    shutil.rmtree(folder.path / "steps", ignore_errors=True)
+    return state.summary()
+
+
+def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> RadianceState:
+    """Read what is fitted to, and start from the newest checkpoint or from nothing."""
+    frames = training_frames(scene, config.cameras)
+    cameras = tuple(dict.fromkeys(frame.view.camera.name for frame in frames))
+    lidar = lidar_rays(scene)
+    extent = extent_of(scene, lidar)
+    pixels, shown = recorded_pixels(scene, frames, config.width_px, cameras, extent)
+    if not pixels.sky_known:
+        log.info("the sky of this scene is not labelled: fitted without the sky term")
+    facts = {"method": config.method, "scene": scene.id}
+    field = RadianceField(sizes_of(config.radiance), extent, cameras, facts, config.seed).to(device)
+    state = RadianceState(field, _optimisers(field), pixels, lidar, shown)
+    found = checkpoint.latest(folder.path / "steps")
+    if found is not None:
+        log.info(f"resuming at step {found.step} of {config.iterations}")
+        _restore(state, found)
+    return state
+
+
+def sizes_of(settings: RadianceConfig) -> FieldSizes:
+    """The sizes of the networks."""
+    proposals = (settings.first_proposal_grid, settings.second_proposal_grid)
+    return FieldSizes(settings.static_grid, settings.dynamic_grid, settings.flow_grid, proposals, settings.width,
+                      settings.proposal_width, APPEARANCE)  # fmt: skip
+
+
+def budget_of(settings: RadianceConfig) -> Budget:
+    """The samples of a ray."""
+    return Budget(settings.proposal_samples, settings.samples, NEAR_M, FAR_M)
+
+
+# ---- the loop --------------------------------------------------------------------------------------------------------
+
+
+def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
+    """Fit up to step ``config.iterations``. Same inputs, same result, also across an interruption."""
+    pace = checkpoint.Pace()
+    with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
+        while state.step < config.iterations:
+            began, step = time.perf_counter(), state.step + 1
+            terms = take_step(state, config, step)
+            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
+            if step % LOG_EVERY == 0 or step == config.iterations:
+                state.last = _progress(terms)
+                folder.log(step=step, seconds=round(state.seconds, 3), **state.last)
+                bar.update(f"psnr {state.last['psnr']:.1f}")
+            if step % config.preview_every == 0 and step < config.iterations:
+                write_preview(
+                    state.field, state.shown, budget_of(config.radiance), folder.path / "preview" / f"{step:06d}.png"
+                )
+            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
+                with pace.saving():
+                    save_checkpoint(state, folder)
+            bar.advance()
+            if interruption.requested:
+                folder.pause(state.summary())
+                interruption.stop_now()
+
+
+def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
+    """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
+    settings, field = config.radiance, state.field
+    device, budget = field.device, budget_of(settings)
+    weights = replace(WEIGHTS, dynamic=WEIGHTS.dynamic * dynamic_share(step, config.iterations))
+    learns = step <= WARM_UP * config.iterations or step % PROPOSALS_EVERY == 0
+    for optimiser in state.optimisers:
+        for group in optimiser.param_groups:
+            group["lr"] = RATE * rate_share(step, config.iterations)
+
+    generator = batch_generator(config.seed, step, "pixels")
+    batch = state.pixels.batch(settings.rays, ERROR_SHARE, generator)
+    marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
+    sky = None if batch.sky is None else batch.sky.to(device)
+    terms, error = pixel_terms(
+        field, rays, marched, draws, (batch.rgb.to(device), batch.counts.to(device), sky), weights
+    )
+    _learn(state, terms, marched, learns, f"step {step}, pixels")
+    state.pixels.note(batch.cells, error)
+    if state.lidar is None:
+        return terms
+
+    generator = batch_generator(config.seed, step, "lidar")
+    given, range_m = state.lidar.batch(settings.lidar_rays, field.extent, generator)
+    marched, draws, _ = _marched(field, given, budget, generator, learns)
+    sight_m = sight_width(step, config.iterations)
+    measured = lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
+    _learn(state, measured, marched, learns, f"step {step}, LiDAR")
+    return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
+
+
+def _marched(
+    field: RadianceField, rays: Rays, budget: Budget, generator: torch.Generator, learns: bool
+) -> tuple[Marched, RayDraws, Rays]:
+    """A training batch on the device: marched, with what was drawn for it. The one way there."""
+    there = rays.to(field.device)
+    draws = RayDraws.of(len(rays), budget, generator, field.device)
+    return march(field, there, budget, draws, learns), draws, there
+
+
+def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, learns: bool, where: str) -> None:
+    """One step of the optimisers down the sum of the terms; NumericsError before that if something is not finite."""
+    total = torch.stack(list(terms.values())).sum()
+    total = total + proposal_loss(marched) if learns else total
+    if not bool(torch.isfinite(total)):
+        odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
+        raise NumericsError("a loss term is not finite", where=where, got=", ".join(odd) or "proposals",
+                            remedy="the parameters are those of the step before; another --seed draws other rays")  # fmt: skip
+    for optimiser in state.optimisers:
+        optimiser.zero_grad(set_to_none=True)
+    total.backward()
+    named = [(name, value.grad) for name, value in state.field.named_parameters() if value.grad is not None]
+    sums = torch.stack([gradient.sum() for _, gradient in named])
+    if not bool(torch.isfinite(sums).all()):
+        odd = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
+        if odd:
+            raise NumericsError("a gradient is not finite", where=where, got=", ".join(odd[:3]),
+                                remedy="the parameters are those of the step before; another --seed draws other rays")  # fmt: skip
+    for optimiser in state.optimisers[: 2 if learns else 1]:
+        optimiser.step()
+
+
+def rate_share(step: int, iterations: int) -> float:
+    """Learning rate of a step (from 1) as a share of the full one."""
+    rising = min(1.0, step / max(1.0, WARM_UP * iterations))
+    return rising * FALL ** sum(step > share * iterations for share in FALLS_AT)
+
+
+def dynamic_share(step: int, iterations: int) -> float:
+    """Weight of the dynamic density at a step as a share of the full one."""
+    first, last = DYNAMIC_RISE
+    return min(1.0, max(0.0, (step / iterations - first) / max(last - first, 1e-9)))
+
+
+def sight_width(step: int, iterations: int) -> float:
+    """Half width of the surface in the line-of-sight term at a step, metres; 0 before it begins."""
+    since = step / iterations - SIGHT_START
+    return 0.0 if since <= 0 else max(SIGHT_LEAST_M, SIGHT_M * 0.5 ** math.floor(since / SIGHT_HALVES))
+
+
+def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
+    values = torch.stack([value.detach() for value in terms.values()]).tolist()
+    named = {f"loss_{name}": round(value, 7) for name, value in zip(terms, values)}
+    return {"psnr": round(-10 * math.log10(max(named["loss_color"], 1e-10)), 3), **named}
+
+
+# ---- the optimisers, and checkpoints ---------------------------------------------------------------------------------
+
+
+def _optimisers(field: RadianceField) -> tuple[torch.optim.Adam, torch.optim.Adam]:
+    proposals = list(field.proposals.parameters())
+    own = {id(value) for value in proposals}
+    fused = field.device.type in ("cpu", "cuda")
+    first, second = (
+        torch.optim.Adam(
+            given, RATE, BETAS, EPSILON, WEIGHT_DECAY, fused=fused, foreach=None if fused else False
+        )
+        for given in ([value for value in field.parameters() if id(value) not in own], proposals)
+    )
+    return first, second
+
+
+def _moments(state: RadianceState) -> dict[str, Tensor]:
+    made = {}
+    for name, value in state.field.named_parameters():
+        for optimiser in state.optimisers:
+            for kind, moment in optimiser.state.get(value, {}).items():
+                made[f"{kind}.{name}"] = moment.detach().cpu()
+    return made
+
+
+def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
+    """All that changes: parameters, moments, the error map, the step."""
+    groups = {
+        "field": {name: value.cpu() for name, value in state.field.state_dict().items()},
+        "moments": _moments(state), "errors": {"errors": state.pixels.errors},
+    }  # fmt: skip
+    checkpoint.save(
+        folder.path / "steps", state.step, groups, {"seconds": state.seconds, "last": dict(state.last or {})}
+    )
+
+
+def _restore(state: RadianceState, found: checkpoint.Checkpoint) -> None:
+    state.field.load_state_dict(found.tensors("field"))
+    moments = found.tensors("moments")
+    for name, value in state.field.named_parameters():
+        for optimiser in state.optimisers:
+            if any(value is one for group in optimiser.param_groups for one in group["params"]):
+                kept = {
+                    kind: moments[f"{kind}.{name}"]
+                    for kind in ("step", "exp_avg", "exp_avg_sq")
+                    if f"{kind}.{name}" in moments
+                }
+                if kept:
+                    optimiser.state[value] = {kind: tensor.to(value.device) for kind, tensor in kept.items()}
+    state.pixels.errors = found.tensors("errors")["errors"]
+    state.step, state.seconds, state.last = found.step, float(found.state["seconds"]), found.state["last"]

@@ -1,0 +1,224 @@
+"""The fit of ``omnire``: OmniRe (Chen et al. 2024) without body models.
+
+Published, and here: rigid nodes for vehicles, nodes deformed by one network with an embedding per object for people and cyclists,
+which begins after a tenth of the run; the weight of LiDAR depth. Left out: SMPL bodies. Different (``docs/baselines.md``): everything
+else is ``street_gaussians``, with its sky, start and densification; the network is small unless asked for.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Final, Self
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import seeds
+from mudg.base.types import FusedCloud, Scene
+from mudg.baselines.flat_network import FlatNetwork, waves
+from mudg.core.table import Table
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
+from mudg.gaussians.recipes import DrawnView, OwnRecipe
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.start import start_model
+from mudg.gaussians.views import StoredView, TrainView
+
+# deformed -------------------------------------------------------------------------------------------------------------
+#
+# People and cyclists that one network deforms (the deformable nodes of OmniRe, Chen et al. 2024).
+#
+# Within its box every Gaussian of such an object moves by ``network(x, t, z)``: its place in the box, the time, and what tells the
+# object from others, an embedding that is learnt. One network serves all objects of a scene; it is a node without Gaussians.
+
+
+EMBEDDING: Final = 16
+PLACE_OCTAVES, TIME_OCTAVES = 4, 4
+INPUTS: Final = 3 * (1 + 2 * PLACE_OCTAVES) + (1 + 2 * TIME_OCTAVES) + EMBEDDING
+
+
+class DeformationField(StaticNode):
+    """The network that deforms, and the embeddings of its objects.
+
+    Its table: ``network`` [1, P] (``FlatNetwork``) and ``embeddings`` [1, K, 16].
+
+    Args:
+        span_s: first and last time of the log, seconds. layers, width: of the network.
+    """
+
+    kind = "deformation"
+
+    def __init__(self, name: str, span_s: tuple[float, float], layers: int, width: int, learnt: Table) -> None:
+        super().__init__(name)
+        self.span_s, self.layers, self.width, self.learnt = span_s, layers, width, learnt
+        self.network = network_of(layers, width)
+
+    @classmethod
+    def fresh(
+        cls, span_s: tuple[float, float], layers: int, width: int, objects: int, run_seed: int
+    ) -> DeformationField:
+        """A field that moves nothing yet."""
+        generator = seeds.torch_generator(run_seed, 0, "deformation field")
+        network = network_of(layers, width).start(generator)
+        embeddings = torch.randn(1, objects, EMBEDDING, generator=generator)
+        return cls("deformation field", span_s, layers, width, Table({"network": network, "embeddings": embeddings}))
+
+    def displacement(self, place: Tensor, time_s: float, instance: int) -> Tensor:
+        """How far Gaussians move at a time, ``[n, 3]`` metres in the frame of the box.
+
+        Args:
+            place: ``[n, 3]``, -1 to 1 within the box. instance: number of the object's embedding.
+        """
+        first, last = self.span_s
+        moment = place.new_full((1, 1), 2 * (time_s - first) / max(last - first, 1e-6) - 1)
+        same = torch.cat([waves(moment, TIME_OCTAVES), self.learnt["embeddings"][:, instance]], 1)
+        return self.network(
+            self.learnt["network"], torch.cat([waves(place, PLACE_OCTAVES), same.expand(len(place), -1)], 1)
+        )
+
+    def parameters(self) -> Table:
+        """See ``StaticNode``."""
+        return self.learnt
+
+    def to(self, device: torch.device) -> Self:
+        """See ``StaticNode``."""
+        there = copy.copy(self)
+        there.learnt = self.learnt.to(device)
+        return there
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        facts = {"name": self.name, "span_s": list(self.span_s), "layers": self.layers, "width": self.width}
+        return facts, self.learnt.state()
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> DeformationField:
+        """Inverse of ``state``."""
+        first, last = facts["span_s"]
+        return cls(
+            str(facts["name"]),
+            (float(first), float(last)),
+            int(facts["layers"]),
+            int(facts["width"]),
+            Table.from_state(tensors),
+        )
+
+
+def network_of(layers: int, width: int) -> FlatNetwork:
+    """The network of a field: ``layers`` hidden layers of a width."""
+    return FlatNetwork((INPUTS, *[width] * layers, 3))
+
+
+class DeformedNode(RigidNode):
+    """A tracked object whose Gaussians also move within its box as a ``DeformationField`` of the same scene says.
+
+    ``instance``: number of its embedding. Without a field (before the scene is put together, or ``resting``) it is rigid.
+    """
+
+    kind = "deformed"
+    instance: int = 0
+    field: DeformationField | None = None
+    rests: bool = False
+
+    @classmethod
+    def of_rigid(cls, node: RigidNode, instance: int) -> DeformedNode:
+        """The same object, deformed."""
+        offsets = Table({name: node.offsets[name].detach() for name in ("shift", "yaw")})
+        made = cls(node.name, node.label, node.size_m, node.times_s, node.world_from_object, offsets, node.learn_pose)
+        made.instance = instance
+        return made
+
+    def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
+        """See ``RigidNode``."""
+        found = next((node for node in nodes if isinstance(node, DeformationField)), None)
+        if found is self.field:
+            return self
+        made = copy.copy(self)
+        made.field = found
+        return made
+
+    def resting(self) -> Self:
+        """The same object without its deformation."""
+        made = copy.copy(self)
+        made.rests = True
+        return made
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """See ``StaticNode``."""
+        if self.field is None or self.rests or len(rows.means) == 0 or self.keys_around(time_s) is None:
+            return super().at_time(rows, time_s)
+        place = (
+            2 * rows.means / torch.tensor(self.size_m, dtype=rows.means.dtype).to(rows.means.device, non_blocking=True)
+        )
+        moved = self.field.displacement(place, time_s, self.instance)
+        return super().at_time(replace(rows, means=rows.means + moved), time_s)
+
+    def moved(self, object_from_new: NDArray[Any]) -> Self:
+        """See ``RigidNode``."""
+        made = super().moved(object_from_new)
+        made.instance, made.field = self.instance, self.field
+        return made
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        facts, tensors = super().state()
+        return facts | {"instance": self.instance}, tensors
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
+        """Inverse of ``state``; the scene links the field."""
+        made = super().from_state(facts, tensors)
+        made.instance = int(facts["instance"])
+        return made
+
+
+# omnire ---------------------------------------------------------------------------------------------------------------
+
+
+RIGID_SHARE: Final = 0.1
+"""Share of the run before the network joins (published: 3000 of 30,000 steps)."""
+LAYERS, WIDTH = 4, 64
+"""Hidden layers of the network, and their width (published: 8 of 256)."""
+LIDAR_WEIGHT: Final = 0.01
+"""Of the mean absolute difference of depth, per metre."""
+
+
+class OmniRecipe(OwnRecipe):
+    """See the module's text."""
+
+    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight",)
+    last_densified: ClassVar[float] = 0.5
+
+    def start(
+        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+    ) -> SceneModel:
+        """See ``Recipe``."""
+        model = start_model(scene, fused, views, classes, config)
+        limbed = [node for node in model.nodes if isinstance(node, DeformableNode)]
+        if not limbed:
+            return model
+        times = [frame.view.time_s for frame in scene.frames]
+        field = DeformationField.fresh((min(times), max(times)), LAYERS, WIDTH, len(limbed), config.seed)
+        nodes = [
+            DeformedNode.of_rigid(node, limbed.index(node)) if isinstance(node, DeformableNode) else node
+            for node in model.nodes
+        ]
+        return replace(model, nodes=(*nodes, field))
+
+    def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
+        """See ``Recipe``: at first all objects are rigid."""
+        if step > RIGID_SHARE * config.iterations:
+            return model
+        return model.with_nodes(
+            tuple(node.resting() if isinstance(node, DeformedNode) else node for node in model.nodes)
+        )
+
+    def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
+        """See ``Recipe``."""
+        lidar = drawn.view.lidar
+        if lidar is None or not len(lidar.pixel):
+            return {}
+        return {"lidar": LIDAR_WEIGHT * (drawn.render.depth.reshape(-1)[lidar.pixel] - lidar.depth_m).abs().mean()}

@@ -1,0 +1,211 @@
+"""The fit of ``pvg``: Periodic Vibration Gaussians (Chen et al. 2023), a dynamic street without boxes.
+
+Published, and here: the two equations of ``baselines/pvg.py``; temporal smoothing; the losses and weights below; children of
+split Gaussians at other times of their parent's life. Different here (``docs/baselines.md``): a panorama for the sky's cube map,
+starting points with the colours of the photographs, our filling of what LiDAR does not reach, no limits on size that grow with the
+distance, no growing image sizes. Published lengths are those of scenes of `SCENE_UNIT_M`.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mudg.base import log, seeds
+from mudg.base.types import FusedCloud, Scene
+from mudg.baselines.timed import timed_points
+from mudg.core import losses
+from mudg.core.table import Table
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import NodeRows, StaticNode
+from mudg.gaussians.recipes import BOX_SETTINGS, SCENE_UNIT_M, DrawnView, OwnRecipe
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.start import painted_sky
+from mudg.gaussians.views import StoredView, TrainView
+
+# vibration ------------------------------------------------------------------------------------------------------------
+#
+# A world without boxes whose Gaussians swing about a point and show for a while (Periodic Vibration Gaussians, Chen et al. 2023).
+#
+# Every Gaussian has a peak time ``tau``, a life span ``beta`` and a velocity ``v``. At the time t, with the cycle l,
+#
+#     mean(t)    = mean + v sin(2 pi (t - tau) / l) l / (2 pi)
+#     opacity(t) = opacity exp(-(t - tau)^2 / (2 beta^2)),   nothing where the factor is at most 0.05
+#
+# What stands still has a long life span and no velocity; what moves is either carried by its velocity or drawn by Gaussians that show
+# one after the other. Times are counted in units of 50 frames (a frame is 0.02), 0 in the middle of the log, as published.
+#
+# Columns: ``tau`` [N], ``log_beta`` [N] (natural logarithm), ``velocity`` [N, 3] metres per unit of time.
+
+
+FRAME: Final = 0.02
+"""A frame in units of time."""
+CYCLE: Final = 0.2
+LEAST_FACTOR: Final = 0.05
+SHRINK: Final = 1.6
+"""The life span of children of a late split is this much shorter."""
+
+
+class VibrationNode(StaticNode):
+    """The whole world as vibrating Gaussians.
+
+    Args:
+        name: of the node.
+        middle_s: seconds; time 0. frame_s: seconds between frames.
+        early: difference D between the time that is drawn and the time whose state is drawn, in units of time; the state at t - D is
+            carried by D times the average velocity (temporal smoothing, while fitting).
+    """
+
+    kind = "vibration"
+    short_life = 0.01
+
+    def __init__(self, name: str, middle_s: float, frame_s: float, early: float = 0.0) -> None:
+        super().__init__(name)
+        self.middle_s, self.frame_s, self.early = float(middle_s), float(frame_s), float(early)
+
+    @classmethod
+    def of_times(cls, times_s: Sequence[float], name: str = "background") -> VibrationNode:
+        """The node of a log with images at these times (repeats allowed)."""
+        times = sorted(set(times_s))
+        span = times[-1] - times[0]
+        return cls(name, (times[0] + times[-1]) / 2, span / (len(times) - 1) if span > 0 else 0.1)
+
+    def smoothed(self, early: float) -> VibrationNode:
+        """The same node drawing the state of ``early`` units of time before."""
+        other = copy.copy(self)
+        other.early = float(early)
+        return other
+
+    def time_of(self, time_s: float) -> float:
+        """Seconds to units of time."""
+        return (time_s - self.middle_s) / self.frame_s * FRAME
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """See ``StaticNode``."""
+        tau, beta, velocity = rows.own["tau"], rows.own["log_beta"].exp(), rows.own["velocity"]
+        since = self.time_of(time_s) - self.early - tau
+        factor = torch.exp(-(since**2) / (2 * beta**2))
+        swing = torch.sin(since * (2 * math.pi / CYCLE)) * (CYCLE / (2 * math.pi))
+        means = rows.means + velocity * swing[:, None]
+        if self.early:
+            means = means + average_velocity(velocity, beta) * self.early
+        return replace(rows, means=means, opacity=rows.opacity * factor * (factor > LEAST_FACTOR))
+
+    def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
+        """Children of split rows: each at another time of its parent's life, where the parent would be then.
+
+        Args:
+            noise: standard normal ``[n]``.
+            late: whether the life span shrinks too (the second half of densification).
+        """
+        beta = columns["log_beta"].exp()
+        later = beta * noise
+        moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]
+        shorter = math.log(SHRINK) * (beta >= self.short_life) if late else torch.zeros_like(beta)
+        return {**columns, "means": moved, "tau": columns["tau"] + later, "log_beta": columns["log_beta"] - shorter}
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        return {"name": self.name, "middle_s": self.middle_s, "frame_s": self.frame_s}, {}
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> VibrationNode:
+        """Inverse of ``state``."""
+        return cls(str(facts["name"]), float(facts["middle_s"]), float(facts["frame_s"]))
+
+
+def average_velocity(velocity: Tensor, beta: Tensor) -> Tensor:
+    """``v exp(-beta / (2 l))`` [N, 3], metres per unit of time: what lives long has a swing, but goes nowhere."""
+    return velocity * torch.exp(-beta / (2 * CYCLE))[:, None]
+
+
+def starting_columns(count: int, tau: Tensor, duration: float) -> dict[str, Tensor]:
+    """Columns of Gaussians that have not learnt to move: ``tau`` [count] and ``duration`` in units of time."""
+    beta = math.sqrt(0.1 * max(duration, FRAME))
+    return {"tau": tau.float(), "log_beta": torch.full((count,), math.log(beta)), "velocity": torch.zeros(count, 3)}
+
+
+def moving_rows(columns: Mapping[str, Tensor], least_beta: float = 0.2) -> Tensor:
+    """Bool[N]: Gaussians that show for a short while only, which draw what moves (published: all with beta at most 0.2)."""
+    return columns["log_beta"].detach().exp() <= least_beta
+
+
+# pvg ------------------------------------------------------------------------------------------------------------------
+
+
+SMOOTHING_PROBABILITY: Final = 0.5
+SMOOTHING_FRAMES: Final = 3.0
+"""The width of the interval that the difference of times is drawn from, in frames."""
+LIDAR_WEIGHT, LIDAR_DECAY_STEPS = 0.1, 8000.0
+SKY_WEIGHT, ENTROPY_WEIGHT, SMOOTH_WEIGHT, VELOCITY_WEIGHT = 0.05, 0.05, 0.001, 0.01
+SKY_M: Final = 900.0 * SCENE_UNIT_M
+FILLED_SPAN: Final = 1.2
+"""Points without a time of their own start at times spread over this many durations of the log."""
+
+
+class VibrationRecipe(OwnRecipe):
+    """See the module's text."""
+
+    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "sky_weight")
+    unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
+    last_densified: ClassVar[float] = 0.5
+
+    def start(
+        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+    ) -> SceneModel:
+        """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
+        node = VibrationNode.of_times([frame.view.time_s for frame in scene.frames])
+        found = timed_points(scene, views, classes, config, fused.colors)
+        duration = FRAME * (len({frame.view.time_s for frame in scene.frames}) - 1)
+        drawn = (
+            (seeds.numpy_rng(config.seed, 0, "start times").random(len(found.time_s)) - 0.5) * FILLED_SPAN * duration
+        )
+        measured = (found.time_s - node.middle_s) / node.frame_s * FRAME
+        tau = torch.from_numpy(np.where(np.isnan(found.time_s), drawn, measured))
+        columns = found.points.columns(classes, config.sh_degree) | starting_columns(len(tau), tau, duration)
+        log.info(f"start: {len(tau)} vibrating Gaussians")
+        owner = torch.zeros(len(tau), dtype=torch.int32)
+        sky = painted_sky(views, fused.colors)
+        return SceneModel(Table(columns, {"node": owner}), (node,), sky, classes, config.sh_degree, colors=fused.colors)
+
+    def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
+        """See ``Recipe``: at every second step or so, the state of another time, carried to the view's."""
+        rng = seeds.numpy_rng(config.seed, step, "temporal smoothing")
+        if rng.random() >= SMOOTHING_PROBABILITY:
+            return model
+        early = SMOOTHING_FRAMES * (rng.random() - 0.5) * FRAME
+        return model.with_nodes(
+            tuple(node.smoothed(early) if isinstance(node, VibrationNode) else node for node in model.nodes)
+        )
+
+    def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
+        """See ``Recipe``. The velocity is averaged over Gaussians by what they show of themselves at the time (published: over pixels)."""
+        render, view = drawn.render, drawn.view
+        inverse = losses.inverse_depth(render.depth, render.alpha, SKY_M) * SCENE_UNIT_M
+        terms = {
+            "entropy": ENTROPY_WEIGHT * losses.opacity_entropy(render.alpha),
+            "smooth": SMOOTH_WEIGHT * losses.edge_aware(inverse, view.rgb),
+            "velocity": VELOCITY_WEIGHT * mean_velocity(drawn),
+        }
+        if view.sky is not None:
+            terms["sky"] = SKY_WEIGHT * losses.empty_sky(render.alpha, view.sky)
+        if view.lidar is not None and len(view.lidar.pixel):
+            weight = LIDAR_WEIGHT * math.exp(-drawn.published_step / LIDAR_DECAY_STEPS)
+            terms["lidar"] = weight * losses.sparse_inverse_depth(
+                inverse, view.lidar.pixel, view.lidar.depth_m / SCENE_UNIT_M
+            )
+        return terms
+
+
+def mean_velocity(drawn: DrawnView) -> Tensor:
+    """Mean absolute component of the average velocities, in scene units per unit of time, weighted by the opacity of the moment."""
+    table, weight = drawn.model.table, drawn.gaussians.opacity.detach()
+    speed = average_velocity(table["velocity"], table["log_beta"].exp()).abs().mean(1)
+    return (speed * weight).sum() / weight.sum().clamp_min(1e-9) / SCENE_UNIT_M

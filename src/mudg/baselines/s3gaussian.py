@@ -1,0 +1,289 @@
+"""The fit of ``s3gaussian``: S3Gaussian (Huang et al. 2024), a dynamic street without boxes, moved by a field of place and time.
+
+Published, and here: the field of ``baselines/s3gaussian.py``, a static first stage, losses and weights below, no sky. Left out: the
+head that imitates features of a vision network. Different (``docs/baselines.md``): changes of colour of the constant band only; planes
+are small unless asked for; the field is asked only for Gaussians near the frustum. Terms are divided by 1.2, since the common
+colour term has weights of sum 1 and the published one L1 + 0.2 (1 - SSIM).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, ClassVar, Final, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mudg.base import log, seeds
+from mudg.base.types import FusedCloud, Scene, View
+from mudg.baselines.flat_network import FlatNetwork
+from mudg.baselines.timed import timed_points
+from mudg.core import losses
+from mudg.core.grids import TIME, PlaneSizes, look_up
+from mudg.core.table import Table
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import NodeRows, StaticNode
+from mudg.gaussians.recipes import BOX_SETTINGS, DrawnView, OwnRecipe
+from mudg.gaussians.schedule import FIELD_STEPS
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.views import StoredView, TrainView
+
+# hexplane -------------------------------------------------------------------------------------------------------------
+#
+# A world without boxes whose Gaussians are moved and recoloured by a field of place and time (S3Gaussian, Huang et al. 2024).
+#
+# The field lies in six planes (xy, xz, yz and xt, yt, zt) of several sizes. A Gaussian at x, y, z and the time t takes from each the
+# bilinear value at its place; the six values are multiplied, those of the sizes joined. A linear layer and two small networks turn them
+# into a displacement and a change of colour:
+#
+#     mean(t) = mean + dx(x, y, z, t)        colour(t) = colour + dc(x, y, z, t)
+#
+# Rows outside the box of the field keep still.
+
+
+FRUSTUM_MARGIN: Final = 1.3
+"""A Gaussian may be moved this much further than the edge of the image, as a share of half the image, plus `NEAR_MARGIN_M`."""
+NEAR_MARGIN_M: Final = 5.0
+SPACE_START: Final = (0.1, 0.5)
+"""Planes of space start between these."""
+SHORT_GAIN: Final = (sum(SPACE_START) / 2) ** -3
+"""Factor that makes the product of three such planes about 1."""
+
+
+class HexPlaneNode(StaticNode):
+    """The whole world as Gaussians that a field moves.
+
+    Its table: ``planes`` [1, P], all planes one after the other, and ``plane_network`` [1, Q].
+
+    Args:
+        low, high: corners of the field's box: x, y, z in metres, t in seconds.
+        gain: factor on the features (published: 1).
+    """
+
+    kind = "hexplane"
+
+    def __init__(
+        self, name: str, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, learnt: Table, gain: float = 1.0
+    ) -> None:
+        super().__init__(name)
+        self.low, self.high = tuple(map(float, low)), tuple(map(float, high))
+        self.sizes, self.learnt, self.gain, self.rests = sizes, learnt, float(gain), False
+        self._view: View | None = None
+        inner = sizes.features * sizes.levels
+        self.networks = (
+            FlatNetwork((inner, sizes.width)),
+            FlatNetwork((sizes.width, sizes.width, 3), leading=True),
+            FlatNetwork((sizes.width, sizes.width, 3), leading=True),
+        )
+
+    @classmethod
+    def fresh(
+        cls, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, run_seed: int, gain: float = 1.0
+    ) -> HexPlaneNode:
+        """A field that moves nothing yet: planes of space between 0.1 and 0.5, planes of time 1."""
+        least, most = SPACE_START
+        generator = seeds.torch_generator(run_seed, 0, "hexplane")
+        planes = [
+            torch.ones(shape).flatten()
+            if TIME in axes
+            else torch.rand(shape, generator=generator).flatten() * (most - least) + least
+            for axes, shape in sizes.shapes
+        ]
+        node = cls("background", low, high, sizes, Table({"planes": torch.zeros(1, 1)}), gain)
+        trunk, *heads = node.networks
+        network = [trunk.start(generator, silent=False), *(head.start(generator) for head in heads)]
+        node.learnt = Table({"planes": torch.cat(planes)[None], "plane_network": torch.cat(network, 1)})
+        return node
+
+    def resting(self) -> Self:
+        """The same world without the field."""
+        made = copy.copy(self)
+        made.rests = True
+        return made
+
+    def seen_by(self, view: View) -> Self:
+        """The same world for one view: the field is asked for Gaussians in and around its frustum only."""
+        made = copy.copy(self)
+        made._view = view
+        return made
+
+    def planes(self) -> Iterator[tuple[tuple[int, int], Tensor]]:
+        """Axes and numbers ``[second axis, first axis, features]`` of every plane, level by level."""
+        return self.sizes.planes(self.learnt["planes"][0])
+
+    def features(self, places: Tensor) -> Tensor:
+        """What the planes say at places ``[n, 4]``, -1 to 1 along x, y, z, t, times the gain: ``[n, features * levels]``."""
+        return self.gain * look_up(places, self.learnt["planes"][0], self.sizes)
+
+    def changes(self, means: Tensor, time_s: float) -> tuple[Tensor, Tensor]:
+        """Displacement ``[n, 3]`` m and change of colour ``[n, 3]`` of Gaussians at ``means`` [n, 3] at a time."""
+        low, high = (means.new_tensor(corner) for corner in (self.low, self.high))
+        places = 2 * (torch.cat([means, means.new_full((len(means), 1), time_s)], 1) - low) / (high - low) - 1
+        flat, found, offset = self.learnt["plane_network"], [], 0
+        for network in self.networks:
+            found.append(flat[:, offset : offset + network.numbers])
+            offset += network.numbers
+        trunk, move, color = self.networks
+        hidden = trunk(found[0], self.features(places))
+        return move(found[1], hidden), color(found[2], hidden)
+
+    def asked(self, means: Tensor) -> Tensor:
+        """Rows i64[m] that the field may change: in its box, and near the frustum of the view if there is one."""
+        with torch.no_grad():
+            low, high = (means.new_tensor(corner[:3]) for corner in (self.low, self.high))
+            inside = ((means >= low) & (means <= high)).all(1)
+            if self._view is not None:
+                inside &= _near_frustum(self._view, means)
+            return inside.nonzero()[:, 0]
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """See ``StaticNode``."""
+        if self.rests:
+            return rows
+        asked = self.asked(rows.means)
+        moved, colored = self.changes(rows.means[asked], time_s)
+        return replace(
+            rows, means=rows.means.index_add(0, asked, moved), sh_dc=rows.sh_dc.index_add(0, asked, colored[:, None])
+        )
+
+    def parameters(self) -> Table:
+        """See ``StaticNode``."""
+        return self.learnt
+
+    def to(self, device: torch.device) -> Self:
+        """See ``StaticNode``."""
+        there = copy.copy(self)
+        there.learnt = self.learnt.to(device)
+        return there
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """See ``StaticNode``."""
+        return {
+            "name": self.name,
+            "low": list(self.low),
+            "high": list(self.high),
+            "gain": self.gain,
+            **asdict(self.sizes),
+        }, self.learnt.state()
+
+    @classmethod
+    def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HexPlaneNode:
+        """Inverse of ``state``."""
+        sizes = PlaneSizes(**{name: int(facts[name]) for name in PlaneSizes.__dataclass_fields__})
+        return cls(str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors), float(facts["gain"]))
+
+
+def _near_frustum(view: View, means: Tensor) -> Tensor:
+    """Bool[N]: in the view, or not far from it."""
+    camera, pose = view.camera, means.new_tensor(view.cam_from_world)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    ahead = z.clamp_min(0)
+    across = max(camera.cx, camera.width - camera.cx) / camera.fx * FRUSTUM_MARGIN
+    down = max(camera.cy, camera.height - camera.cy) / camera.fy * FRUSTUM_MARGIN
+    margin = NEAR_MARGIN_M
+    return (z > -margin) & (x.abs() < ahead * across + margin) & (y.abs() < ahead * down + margin)
+
+
+def moving_rows(displacement_m: Tensor) -> Tensor:
+    """Bool[N]: Gaussians whose largest displacement component ``[N, 3]`` is above the mean of all (published rule for display)."""
+    largest = displacement_m.detach().abs().amax(1)
+    return largest > largest.mean()
+
+
+def plane_smoothness(node: HexPlaneNode) -> tuple[Tensor, Tensor, Tensor]:
+    """Three scalars, sums over planes: mean squared second differences of the planes of space (both axes) and of time (along the time),
+    and the mean |1 - value| of the planes of time."""
+    space = time = flat = node.learnt["planes"].new_zeros(())
+    for axes, plane in node.planes():
+        if TIME in axes:
+            time = time + _bending(plane, 0)
+            flat = flat + (1 - plane).abs().mean()
+        else:
+            space = space + _bending(plane, 0) + _bending(plane, 1)
+    return space, time, flat
+
+
+def _bending(plane: Tensor, dim: int) -> Tensor:
+    bent = torch.diff(plane, n=2, dim=dim)  # of two cells, nothing
+    return bent.square().mean() if bent.numel() else bent.sum()
+
+
+# s3gaussian -----------------------------------------------------------------------------------------------------------
+
+
+STATIC_SHARE: Final = 5 / 55
+"""Share of the run before the field joins (published: 5000 steps, then 50,000)."""
+SSIM_SHARE: Final = 0.2
+LIDAR_WEIGHT, LIDAR_SPAN_M = 0.5, 80.0
+MOVE_WEIGHT, COLOR_WEIGHT = 0.001, 0.001
+SPACE_WEIGHT, TIME_WEIGHT, FLAT_WEIGHT = 1e-4, 0.01, 1e-4
+SIZES: Final = PlaneSizes(features=8, levels=2, space=64, time=25, width=64)
+"""Of the planes and networks (published: 32 features, 4 levels)."""
+FRAMES_PER_CELL: Final = 2
+"""Frames of a cell of time (published: 25 cells for 50 frames): what lies between two shown frames must not have one of its own."""
+BOX_MARGIN: Final = 0.02
+"""The box of the field is that of the LiDAR points, grown by this share."""
+
+
+class FieldRecipe(OwnRecipe):
+    """See the module's text."""
+
+    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "ssim_weight")
+    unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
+    last_densified: ClassVar[float] = 0.5
+
+    def common(self, config: FitConfig) -> FitConfig:
+        """See ``Recipe``."""
+        return replace(config, loss=replace(config.loss, lidar_weight=0.0, ssim_weight=SSIM_SHARE / (1 + SSIM_SHARE)))
+
+    def start(
+        self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+    ) -> SceneModel:
+        """See ``Recipe``. Of the fused cloud only the cameras' colours are used."""
+        found = timed_points(scene, views, classes, config, fused.colors)
+        measured = found.points.xyz[~np.isnan(found.time_s)].astype(np.float64)
+        low, high = measured.min(0), measured.max(0)
+        margin = BOX_MARGIN * (high - low) + 0.1
+        times = [frame.view.time_s for frame in scene.frames]
+        first, last = min(times), max(max(times), min(times) + 1e-3)
+        sizes = replace(SIZES, time=max(2, min(SIZES.time, len(set(times)) // FRAMES_PER_CELL)))
+        gain = SHORT_GAIN if config.iterations < FIELD_STEPS else 1.0
+        node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
+        columns = found.points.columns(classes, config.sh_degree)
+        log.info(
+            f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {sizes.levels} x 6 planes"
+        )
+        owner = torch.zeros(len(found.time_s), dtype=torch.int32)
+        return SceneModel(
+            Table(columns, {"node": owner}), (node,), None, classes, config.sh_degree, colors=fused.colors
+        )
+
+    def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
+        """See ``Recipe``: at first nothing moves; then what is near the frustum."""
+        rests = step <= STATIC_SHARE * config.iterations
+        nodes = (
+            (node.resting() if rests else node.seen_by(view.view)) if isinstance(node, HexPlaneNode) else node
+            for node in model.nodes
+        )
+        return model.with_nodes(tuple(nodes))
+
+    def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
+        """See ``Recipe``."""
+        terms: dict[str, Tensor] = {}
+        lidar, whole = drawn.view.lidar, 1 + SSIM_SHARE
+        if lidar is not None and len(lidar.pixel):
+            terms["lidar"] = (
+                LIDAR_WEIGHT
+                / whole
+                * losses.sparse_squared_depth(drawn.render.depth, lidar.pixel, lidar.depth_m, LIDAR_SPAN_M)
+            )
+        node = drawn.model.nodes[0]
+        if isinstance(node, HexPlaneNode) and not node.rests:
+            table, (space, time, flat) = drawn.model.table, plane_smoothness(node)
+            terms["move"] = MOVE_WEIGHT / whole * (drawn.gaussians.means - table["means"]).abs().mean()
+            terms["recolor"] = COLOR_WEIGHT / whole * (drawn.gaussians.sh - table["sh_dc"]).abs().mean()
+            terms["planes"] = (SPACE_WEIGHT * space + TIME_WEIGHT * time + FLAT_WEIGHT * flat) / whole
+        return terms

@@ -1,0 +1,154 @@
+"""Starting points of methods without boxes: LiDAR points where and when they were measured, coloured by the photographs of that time.
+
+Nothing here knows tracked boxes or the fused cloud (whose dynamic points lie in boxes): a point of a moving car stays where its sweep
+met it. Colours come from training photographs at most half a frame from the sweep, so that a moving point has the colour of its
+own moment; points that none of these shows are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, seeds
+from mudg.base.camera_colors import CameraColors
+from mudg.base.errors import InputError
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import Scene
+from mudg.core.fusion import largest_beam_gap
+from mudg.core.project import RULES as HIDING_RULES
+from mudg.core.project import visible_depth
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.start import StartPoints, fill_unreached, neighbour_scale, thinned, voxel_filter
+from mudg.gaussians.views import StoredView, heads_of
+from mudg.scene.read import read_points
+
+SAME_DEPTH = 0.02
+"""A point is seen by a camera whose nearest depth at its pixel differs by at most this share."""
+MOMENT_FRAMES = 2
+"""Frames that share one of the moments by which points are thinned a second time."""
+LARGEST_M = 150.0
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPoints:
+    """Points and when they were measured, f64[N] seconds; NaN: no time belongs to the point (what LiDAR did not reach)."""
+
+    points: StartPoints
+    time_s: NDArray[np.float64]
+
+
+def timed_points(
+    scene: Scene,
+    views: Sequence[StoredView],
+    classes: tuple[int, ...],
+    config: FitConfig,
+    colors: CameraColors,
+) -> TimedPoints:
+    """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in ``gaussians/start.py``).
+
+    Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all along its way.
+
+    Raises:
+        InputError: no photograph shows any LiDAR point.
+    """
+    xyz, rgb, semantics, time_s = _measured(scene, views, classes, colors)
+    if len(xyz) == 0:
+        raise InputError("no LiDAR point is seen by a training photograph of its time", where=scene.root,
+                         remedy="check the LiDAR of the scene and --cameras")  # fmt: skip
+    centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
+    half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
+    parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]
+    chosen = [
+        (StartPoints(xyz[rows], rgb[rows], semantics[rows], neighbour_scale(xyz[rows])), time_s[rows]) for rows in parts
+    ]
+    filled = fill_unreached(views, xyz, classes, colors)
+    if filled is not None:
+        chosen.append((filled, np.full(len(filled), np.nan)))
+    return TimedPoints(StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen]))
+
+
+def frame_seconds(scene: Scene) -> float:
+    """Seconds between frames; 0.1 where there is only one."""
+    times = sorted({frame.view.time_s for frame in scene.frames})
+    return (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.1
+
+
+def _measured(
+    scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], colors: CameraColors
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]:
+    heads = heads_of(views)
+    near_s = 0.5 * frame_seconds(scene) + 1e-3
+    found: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64]]] = []
+    for sweep in scene.sweeps:
+        nearest: dict[str, int] = {}
+        for index in sorted(range(len(heads)), key=lambda index: abs(heads[index].view.time_s - sweep.time_s)):
+            if abs(heads[index].view.time_s - sweep.time_s) <= near_s:
+                nearest.setdefault(heads[index].view.camera.name, index)
+        if not nearest:
+            continue
+        points = read_points(scene, sweep)
+        xyz, gap = geometry.transform_points(sweep.world_from_lidar, points.xyz), largest_beam_gap(points.xyz)
+        free = np.ones(len(xyz), bool)
+        for index in nearest.values():
+            rows, rgb, semantics = _seen(views[index], xyz, gap, classes, colors)
+            mine = free[rows]
+            rows = rows[mine]
+            free[rows] = False
+            found.append((xyz[rows], rgb[mine], semantics[mine], sweep.time_s + points.dt_s[rows].astype(np.float64)))
+    if not found:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8), np.zeros(0)
+    xyz, rgb, semantics, time_s = (np.concatenate(column) for column in zip(*found))
+    return xyz, rgb, semantics, time_s
+
+
+def _seen(
+    stored: StoredView, xyz: NDArray[np.float32], gap_deg: float, classes: tuple[int, ...], colors: CameraColors
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Rows of the points that a photograph shows, their common colours and train ids."""
+    view, camera = stored.view, stored.view.camera
+    uv, z = geometry.project(view, xyz)
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (z > 0.5)
+            & (z < LARGEST_M)
+            & (uv[:, 0] >= 0)
+            & (uv[:, 0] < camera.width)
+            & (uv[:, 1] >= 0)
+            & (uv[:, 1] < camera.height)
+        )
+    rows = np.flatnonzero(inside)
+    column, row = uv[rows, 0].astype(int), uv[rows, 1].astype(int)
+    nearest = visible_depth(view, xyz, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=LARGEST_M)[row, column]
+    with np.errstate(invalid="ignore"):
+        seen = np.abs(nearest - z[rows]) <= SAME_DEPTH * z[rows]
+    if stored.mask is not None:
+        seen &= stored.mask[row, column]
+    rows, row, column = rows[seen], row[seen], column[seen]
+    train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
+    unknown = np.full(len(rows), UNLABELLED, np.uint8)
+    labels = unknown if stored.channels is None else train_ids[np.minimum(stored.channels[row, column], len(classes))]
+    return rows, colors.bytes_to_common(camera.name, stored.rgb[row, column]), labels
+
+
+def _by_moment(
+    xyz: NDArray[np.float32], time_s: NDArray[np.float64], scene: Scene, config: FitConfig
+) -> list[NDArray[np.int64]]:
+    """Rows, one per cube of space, of every moment; at most the wanted number in all."""
+    moment = np.floor((time_s - time_s.min()) / (MOMENT_FRAMES * frame_seconds(scene)) + 1e-6).astype(np.int64)
+    parts = []
+    for number in np.unique(moment):
+        mine = np.flatnonzero(moment == number)
+        parts.append(mine[voxel_filter(xyz[mine], 2 * config.start.voxel_m)])
+    share = min(1.0, config.start.gaussians / max(1, sum(map(len, parts))))
+    return [
+        rows[
+            np.sort(
+                seeds.numpy_rng(config.seed, index, "moment").permutation(len(rows))[: max(4, int(share * len(rows)))]
+            )
+        ]
+        for index, rows in enumerate(parts)
+    ]

@@ -1,0 +1,398 @@
+"""Static surroundings of the streets: buildings, gardens, walls, fences, the crossing street and the background."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mudg.city import objects as rec
+from mudg.city.config import CityConfig
+from mudg.city.layout import AHEAD_M, StreetPlan
+from mudg.city.objects import BRICK_COLORS, KERB_M, LEAF_COLORS, RENDER_COLORS, Color, Furnisher, plant_tree, record
+from mudg.city.overhead import add_overhead
+
+# objects on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards ----------------------------------------
+
+
+Size = tuple[float, float, float]
+
+
+class Sidewalk:
+    """One sidewalk of the main street; ``side`` +1 left, -1 right; ``front`` = |u| of the building line."""
+
+    def __init__(self, f: Furnisher, side: int, front: float) -> None:
+        plan = f.plan
+        self.f, self.side, self.front = f, side, front
+        self.kerb = abs(plan.kerb(side))
+        self.width = plan.sidewalk(side)
+        self.end = plan.drive_length + AHEAD_M - 40
+        self.corner = (plan.crossing.corner + 2.0) if plan.crossing else 0.0
+        self.facing_street = -side * math.pi / 2  # local +x towards the road
+        self.facing_back = 0.0 if side < 0 else math.pi
+
+    def put(
+        self, kind: int, place: tuple[float, float], across: float, turn: float, size: Size, rgb: Color,
+        rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (),
+    ) -> None:  # fmt: skip
+        """Place an object of half width ``across`` unless it stands in a crossing or there is no room beside the corridor.
+
+        ``place``: metres along the street and from the kerb.
+        """
+        f, (s, from_kerb) = self.f, place
+        if f.near_crossing(s, self.corner + across):
+            return
+        u = f.free_u(
+            s, self.side * (self.kerb + from_kerb), max(across, 0.3), across, self.side, self.side * (self.front - 0.1)
+        )
+        if u is not None:
+            f.place(kind, (s, u), turn, size, rgb, rgb2, parameters)
+
+
+def furnish_sidewalk(f: Furnisher, side: int, front: float) -> None:
+    """Everything on one sidewalk."""
+    walk = Sidewalk(f, side, front)
+    _street_trees(walk)
+    _lamps(walk)
+    _wooden_poles(walk)
+    for _ in range(int(f.rng.integers(4, 9))):
+        _sign(walk, f.uniform(4, f.plan.drive_length + 75))
+    for _ in range(int(f.rng.integers(2, 7))):
+        _furniture(walk, f.uniform(0, f.plan.drive_length + 70))
+    if f.plan.urban and f.chance(0.35):
+        s, step = f.uniform(0, 40), f.uniform(1.4, 2.2)
+        for i in range(int(f.rng.integers(5, 14))):
+            walk.put(rec.BOLLARD, (s + i * step, 0.4), 0.1, 0, (0.12, 0.12, 0.95), (0.03, 0.03, 0.035))
+
+
+def _street_trees(walk: Sidewalk) -> None:
+    f, side = walk.f, walk.side
+    if not f.chance(0.7 if f.plan.urban else 0.8):
+        return
+    spacing = f.uniform(8, 16)
+    s = -20 + f.uniform(0, spacing)
+    while s < walk.end:
+        if f.chance(0.85) and not f.near_crossing(s, walk.corner + 2):
+            u = f.free_u(s, side * (walk.kerb + 0.9), 0.5, 0.35, side, side * (walk.front - 0.4))
+            if u is not None:
+                plant_tree(f, s, u)
+        s += spacing * f.uniform(0.9, 1.1)
+
+
+def _lamps(walk: Sidewalk) -> None:
+    f = walk.f
+    spacing = f.uniform(18, 32)
+    s = -25 + f.uniform(0, spacing)
+    tone = f.uniform(0.03, 0.35)
+    old_style = float(f.plan.urban and f.chance(0.25))
+    height = f.uniform(3.4, 4.4) if old_style else f.uniform(6.5, 9)
+    while s < walk.end:
+        size = (0.2, f.uniform(0.11, 0.17), height)
+        reach = f.uniform(1.2, 2.4)
+        rgb = (tone, tone, tone * 1.03)
+        walk.put(rec.LAMP, (s, 0.5), 0.15, walk.facing_street, size, rgb, parameters=(reach, old_style))
+        s += spacing
+
+
+def _wooden_poles(walk: Sidewalk) -> None:
+    f = walk.f
+    if f.plan.urban or not f.chance(0.7) or walk.side > 0:
+        return
+    s = -20 + f.uniform(0, 25)
+    while s < walk.end:
+        size = (0.26, 0.26, f.uniform(7.5, 9.0))
+        walk.put(rec.POLE, (s, walk.width - 0.5), 0.15, 0, size, (0.16, 0.11, 0.075), parameters=(1.0,))
+        s += 28
+
+
+def _furniture(walk: Sidewalk, s: float) -> None:
+    f = walk.f
+    what = float(f.rng.random())
+    if what < 0.3:
+        size = (0.45, 0.5, f.uniform(0.9, 1.3))
+        rgb = f.pick(((0.03, 0.09, 0.05), (0.05, 0.07, 0.16), (0.09, 0.09, 0.09), (0.2, 0.16, 0.02)))
+        walk.put(rec.BIN, (s, 0.6), 0.3, walk.facing_street, size, rgb)
+    elif what < 0.5:
+        walk.put(rec.BENCH, (s, walk.width * 0.7), 0.35, walk.facing_back, (1.7, 0.5, 0.9), (0.2, 0.1, 0.05))
+    elif what < 0.7 and f.plan.urban:
+        leaves = f.pick(LEAF_COLORS)
+        walk.put(rec.PLANTER, (s, walk.width - 0.8), 0.4, 0, (1.4, 0.6, 0.5), (0.4, 0.39, 0.37), leaves)
+    elif what < 0.85:
+        turn = f.uniform(-0.3, 0.3) + (math.pi if f.chance(0.5) else 0)
+        rgb = f.pick(((0.4, 0.02, 0.02), (0.02, 0.02, 0.03), (0.05, 0.1, 0.35)))
+        walk.put(rec.MOTORBIKE, (s, 0.75), 0.4, turn, (2.0, 0.7, 1.1), rgb)
+    elif walk.width > 3.0:
+        rgb = f.pick(((0.5, 0.1, 0.1), (0.1, 0.3, 0.5)))
+        walk.put(rec.SHELTER, (s, 1.5), 0.9, walk.facing_back, (3.6, 1.5, 2.5), rgb)
+
+
+def _sign(walk: Sidewalk, s: float) -> None:
+    f = walk.f
+    towards = math.pi if walk.side < 0 else 0.0  # right-hand signs face the traffic that drives along +s
+    draw = float(f.rng.random())
+    if draw < 0.3:
+        mask, size, motif, rgb = 1, f.uniform(0.30, 0.38), float(f.rng.integers(0, 3)), (0.7, 0.7, 0.7)
+    elif draw < 0.5:
+        mask, size, motif, rgb = 2, f.uniform(0.36, 0.44), 0.0, (0.7, 0.7, 0.7)
+    elif draw < 0.6:
+        mask, size, motif, rgb = 6, f.uniform(0.36, 0.44), 0.0, (0.7, 0.45, 0.03)
+    elif draw < 0.7:
+        mask, size, motif, rgb = 3, 0.38, 0.0, (0.5, 0.02, 0.03)
+    else:
+        mask, size, motif = 0, f.uniform(0.28, 0.4), 1.0
+        rgb = ((0.02, 0.08, 0.35), (0.03, 0.22, 0.10), (0.72, 0.72, 0.7))[int(f.rng.integers(3))]
+    width = size * f.uniform(1.6, 2.6) if mask == 0 else 0.0
+    ink = (0.75, 0.75, 0.74) if rgb[0] < 0.5 else (0.03, 0.03, 0.03)
+    walk.put(rec.SIGN, (s, f.uniform(0.35, 0.7)), 0.3, towards, (0.1, width, f.uniform(2.1, 2.7)), rgb, ink,
+             (float(mask), size, float(f.chance(0.25)), motif))  # fmt: skip
+
+
+# furnish --------------------------------------------------------------------------------------------------------------
+
+
+def furnish(config: CityConfig, plan: StreetPlan) -> list[list[float]]:
+    """Records of everything static."""
+    f = Furnisher(config, plan)
+    for side in (-1, 1):
+        front = abs(plan.kerb(side)) + plan.sidewalk(side)
+        _building_row(f, side, front)
+        furnish_sidewalk(f, side, front)
+    if plan.crossing is not None:
+        _crossing_surroundings(f)
+    _background(f)
+    if config.overhead > 0:
+        add_overhead(f, config.overhead)
+    return f.rows
+
+
+def _facade(f: Furnisher, shop: bool) -> tuple[float, ...]:
+    bay = f.uniform(2.2, 4.0)
+    modern = f.chance(0.3)
+    width = f.uniform(0.6, 0.85) if modern else f.uniform(0.32, 0.55)
+    window = f.uniform(1.6, 2.1) if modern else f.uniform(1.3, 1.8)
+    sill = f.uniform(0.45, 0.8) if modern else f.uniform(0.75, 1.0)
+    return (
+        bay, f.uniform(2.9, 3.5), f.uniform(3.6, 4.6) if shop else f.uniform(2.9, 3.4), width, sill, window,
+        f.uniform(0.12, 0.28), float(shop),
+    )  # fmt: skip
+
+
+def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: int, depth: float, urban: bool) -> None:
+    """A building whose front runs from (x0, y0) to (x1, y1); ``side`` +1 = it stands to the left of that direction."""
+    length = math.hypot(x1 - x0, y1 - y0)
+    yaw = math.atan2(y1 - y0, x1 - x0)
+    nx, ny = -math.sin(yaw) * side, math.cos(yaw) * side
+    cx, cy = 0.5 * (x0 + x1) + nx * depth / 2, 0.5 * (y0 + y1) + ny * depth / 2
+    brick = f.chance(0.35)
+    shop = urban and f.chance(0.55)
+    if urban:
+        height = f.uniform(8, 14) if f.chance(0.45) else f.uniform(13, 28)
+        gable = height < 12 and f.chance(0.35)
+    else:
+        height = f.uniform(3.3, 6.8)
+        gable = f.chance(0.85)
+    facade = _facade(f, shop)
+    floors = max(1, round((height - facade[2]) / facade[1]))
+    height = facade[2] + floors * facade[1] + (0.2 if gable else 0.7)
+    if not urban and f.chance(0.4):
+        height = facade[2] + 0.25
+    wall = f.pick(BRICK_COLORS if brick else RENDER_COLORS)
+    trim = f.pick(((0.62, 0.60, 0.56), (0.45, 0.43, 0.40), (0.30, 0.29, 0.28), (0.70, 0.69, 0.67)))
+    balconies = float(urban and f.chance(0.35))
+    yaw_out = yaw if side > 0 else yaw + math.pi  # local -y faces the street
+    f.rows.append(
+        record(rec.BUILDING, (cx, cy, 0.0), yaw_out, (length, depth, height), f.seed(), wall, trim,
+               (*facade, float(gable), balconies, float(brick)))
+    )  # fmt: skip
+
+
+def _building_row(f: Furnisher, side: int, front: float) -> None:
+    plan, line = f.plan, f.plan.line
+    s = -60.0 + f.uniform(0, 8)
+    end = plan.drive_length + AHEAD_M - 25
+    while s < end:
+        length = f.uniform(9, 26) if plan.urban else f.uniform(8, 14)
+        if f.near_crossing(s + length / 2, length / 2 + (plan.crossing.sidewalk if plan.crossing else 0) + 1.0):
+            s += 2.0
+            continue
+        setback = (
+            (f.uniform(0.0, 0.6) if f.chance(0.75) else f.uniform(0.6, 3.0)) if plan.urban else f.uniform(3.5, 8.0)
+        )
+        u = side * (front + setback + 0.012 * length)
+        gap_chance = 0.1 if plan.urban else 0.12
+        if f.blocked(s + length / 2, u, length / 2, 0.3):
+            u = plan.ego_u + side * (f.reach + 0.6)
+        if f.chance(gap_chance):
+            _green_lot(f, side, front, s, length)
+        else:
+            x0, y0, _ = line.point(s, u)
+            x1, y1, _ = line.point(s + length, u)
+            _building(f, x0, y0, x1, y1, side, f.uniform(9, 13) if plan.urban else f.uniform(7, 10), plan.urban)
+            if not plan.urban or setback > 1.5:
+                _front_garden(f, side, front, s, length, setback)
+        s += length + ((0.02 if f.chance(0.7) else f.uniform(1, 4)) if plan.urban else f.uniform(3, 9))
+
+
+def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float, setback: float) -> None:
+    plan = f.plan
+    middle, u = s + length / 2, side * (front + 0.25)
+    if f.blocked(middle, u, length / 2 + 2, 0.4):
+        return
+    draw = float(f.rng.random())
+    extent = length + (0 if plan.urban else 2.0)
+    if draw < 0.3:
+        height = f.uniform(0.8, 1.6)
+        f.place(rec.HEDGE, (middle, u + side * 0.2), 0, (extent, f.uniform(0.6, 0.9), height), f.pick(LEAF_COLORS[:3]),
+                parameters=(0, 0, 0, 0.17))  # fmt: skip
+    elif draw < 0.55:
+        brick = f.chance(0.5)
+        color = f.pick(BRICK_COLORS if brick else RENDER_COLORS)
+        f.place(
+            rec.WALL, (middle, u), 0, (extent, 0.24, f.uniform(0.6, 1.5)), color, (0.5, 0.49, 0.46), (float(brick),)
+        )
+    elif draw < 0.9:
+        _fence(f, middle, u, 0, extent)
+    if setback > 3.0:
+        for _ in range(int(f.rng.integers(0, 3))):
+            bush = side * (front + f.uniform(1.2, setback - 0.8))
+            size = f.uniform(0.9, 1.7)
+            f.place(rec.BUSH, (s + f.uniform(0.5, length - 0.5), bush), f.uniform(0, 3),
+                    (size, size, size * f.uniform(0.7, 1.1)), f.pick(LEAF_COLORS), parameters=(0, 0, 0, 0.15),
+                    z=0.08)  # fmt: skip
+        if f.chance(0.5) and setback > 4:
+            plant_tree(f, s + f.uniform(1, length - 1), side * (front + setback * 0.5), garden=True)
+
+
+def _fence(f: Furnisher, s: float, u: float, turn: float, length: float) -> None:
+    style = int(f.rng.integers(0, 3))
+    color = ((0.03, 0.03, 0.03), (0.25, 0.26, 0.26), (0.30, 0.18, 0.09))[style]
+    if style == 0 and f.chance(0.4):
+        color = (0.6, 0.6, 0.58)
+    wide = f.chance(0.35)
+    f.place(rec.FENCE, (s, u), turn, (length, 0.05, f.uniform(0.9, 1.8)), color,
+            parameters=(float(style), 0.16 if wide else 0.13, 0.09 if wide else 0.025))  # fmt: skip
+
+
+def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -> None:
+    middle = s + length / 2
+    u = side * (front + 0.3)
+    if not f.blocked(middle, u, length / 2, 0.4):
+        if f.chance(0.5):
+            _fence(f, middle, u, 0, length)
+        else:
+            brick = f.chance(0.5)
+            f.place(rec.WALL, (middle, u), 0, (length, 0.26, f.uniform(1.0, 2.3)), f.pick(BRICK_COLORS if brick else RENDER_COLORS),
+                    (0.5, 0.49, 0.46), (float(brick),))  # fmt: skip
+    for _ in range(int(length / 5)):
+        plant_tree(f, s + f.uniform(0, length), side * (front + f.uniform(2.5, 12)), garden=True)
+
+
+def _crossing_surroundings(f: Furnisher) -> None:
+    plan, crossing = f.plan, f.plan.crossing
+    if crossing is None:
+        return
+    edge = crossing.half_width + crossing.sidewalk
+    for arm in (-1, 1):
+        if not crossing.has_arm(arm):
+            _close_arm(f, arm)
+            continue
+        inner = abs(plan.kerb(arm)) + plan.sidewalk(arm) + (14 if plan.urban else 19)
+        for side in (-1, 1):
+            a = inner + f.uniform(0, 3)
+            while a < 120:
+                length = f.uniform(9, 22) if plan.urban else f.uniform(8, 13)
+                b = side * (edge + (f.uniform(0.2, 0.8) if plan.urban else f.uniform(3.5, 6)))
+                x0, y0 = crossing.to_world(arm * a, b)
+                x1, y1 = crossing.to_world(arm * (a + length), b)
+                _building(f, x0, y0, x1, y1, side * arm, f.uniform(9, 12), plan.urban)
+                if f.chance(0.5):
+                    x, y = crossing.to_world(arm * (a + 2), side * (crossing.half_width + 0.9))
+                    f.rows.append(record(rec.TREE, (x, y, KERB_M), 0.0, (1, 1, f.uniform(6, 9)), f.seed(), f.pick(LEAF_COLORS),
+                                         (0.13, 0.10, 0.075), (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15)))  # fmt: skip
+                a += length + (0.05 if plan.urban else f.uniform(3, 8))
+        x, y = crossing.to_world(arm * 125.0, 0.0)  # something closes the view
+        _block(f, (x, y), crossing.yaw + arm * -math.pi / 2, (40, 12, f.uniform(9, 16)))
+    if plan.urban or f.chance(0.3):
+        _signals(f)
+
+
+def _block(f: Furnisher, xy: tuple[float, float], yaw: float, size: tuple[float, float, float]) -> None:
+    """A plain building at a place in the world."""
+    f.rows.append(
+        record(rec.BUILDING, (*xy, 0), yaw, size, f.seed(), f.pick(RENDER_COLORS), (0.6, 0.58, 0.55),
+               (*_facade(f, False), 0.0, 0.0, 0.0))
+    )  # fmt: skip
+
+
+def _close_arm(f: Furnisher, arm: int) -> None:
+    """A T-junction: buildings go on along the closed side."""
+    plan, crossing = f.plan, f.plan.crossing
+    if crossing is None:
+        return
+    half = crossing.half_width + crossing.sidewalk + 0.9
+    u = arm * (abs(plan.kerb(arm)) + plan.sidewalk(arm) + (0.4 if plan.urban else 5.0))
+    x0, y0, _ = plan.line.point(crossing.s - half, u)
+    x1, y1, _ = plan.line.point(crossing.s + half, u)
+    if not f.blocked(crossing.s, u, half, 0.3):
+        _building(f, x0, y0, x1, y1, arm, 11.0, plan.urban)
+
+
+def _signals(f: Furnisher) -> None:
+    plan, crossing = f.plan, f.plan.crossing
+    if crossing is None:
+        return
+    lit = float(f.rng.integers(0, 3))
+    gap = crossing.half_width + crossing.corner * 0.6 + 1.6
+    tone = f.uniform(0.03, 0.3)
+    for side, along, towards in ((-1, -gap, math.pi), (-1, gap + 4, math.pi), (1, gap, 0.0), (1, -gap - 4, 0.0)):
+        s = crossing.s + along
+        kerb = abs(plan.kerb(side))
+        u = f.free_u(s, side * (kerb + 0.6), 0.5, 0.4, side, side * (kerb + plan.sidewalk(side)))
+        if u is None:
+            continue
+        arm = f.uniform(2.5, 4.5) if f.chance(0.5) and not f.blocked(s, u - side * 4, 1.0, 1.0) else 0.0
+        # the mast arm of local +y reaches over the road on the driver's side
+        size = (0.3, 0.3, f.uniform(3.4, 3.8) if not arm else 5.6)
+        f.place(rec.SIGNAL, (s, u), towards, size, (tone, tone, tone), parameters=(arm, lit))
+    for arm_side in (-1, 1):
+        if not crossing.has_arm(arm_side):
+            continue
+        a = arm_side * (abs(plan.kerb(arm_side)) + crossing.corner * 0.6 + 1.0)
+        x, y = crossing.to_world(a, arm_side * (crossing.half_width + 0.7))
+        if f.blocked(crossing.s, a, 1.0, crossing.half_width + 1.5):
+            continue
+        facing = crossing.yaw + (0.0 if arm_side > 0 else math.pi)
+        row = record(rec.SIGNAL, (x, y, KERB_M), facing, (0.3, 0.3, 3.5), f.seed(), (tone, tone, tone),
+                     parameters=(0.0, 2.0 - lit))  # fmt: skip
+        f.rows.append(row)
+
+
+def _background(f: Furnisher) -> None:
+    """Taller blocks behind the first row, a wood or a block at the end of the street, hills at the horizon."""
+    plan = f.plan
+    end = plan.drive_length + AHEAD_M - 22
+    x, y, heading = plan.line.point(end, 0)
+    if plan.urban:
+        place = (x + 8 * math.cos(heading), y + 8 * math.sin(heading))
+        _block(f, place, heading - math.pi / 2, (60, 12, f.uniform(12, 24)))
+    for i in range(14):
+        u = (i - 6.5) * 7.0 + f.uniform(-2, 2)
+        size = f.uniform(9, 16)
+        f.place(rec.TREE, (end + f.uniform(16, 30), u), 0, (1, 1, size), f.pick(LEAF_COLORS[:4]), (0.13, 0.10, 0.075),
+                (size * 0.34, 0.8, 0.0, 0.6, 0.25), z=0.0)  # fmt: skip
+    if plan.urban or f.chance(0.4):
+        for side in (-1, 1):
+            for _ in range(int(f.rng.integers(2, 7))):
+                s, u = f.uniform(20, end), side * f.uniform(38, 75)
+                if f.near_crossing(s, 16):
+                    continue
+                size = (f.uniform(12, 24), f.uniform(12, 20), f.uniform(20, 48))
+                f.place(rec.BUILDING, (s, u), 0 if side > 0 else math.pi, size, f.pick(RENDER_COLORS),
+                        parameters=(*_facade(f, False), 0.0, 0.0, 0.0), z=0.0)  # fmt: skip
+    for i in range(8):
+        angle, distance = heading + (i - 3.5) * 0.42, f.uniform(260, 480)
+        height = f.uniform(10, 42)
+        place = (x + distance * math.cos(angle), y + distance * math.sin(angle), -2.0)
+        row = record(rec.HILL, place, f.uniform(0, 3), (f.uniform(160, 320), f.uniform(120, 220), height), f.seed(),
+                     f.pick(LEAF_COLORS[:3]), parameters=(float(np.sign(height - 14) > 0),))  # fmt: skip
+        f.rows.append(row)

@@ -1,0 +1,252 @@
+"""Street plan of the city: centreline, lanes, kerbs, crossing street, markings; and the drive along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import seeds
+from mudg.city.config import CityConfig
+
+Array = NDArray[np.float64]
+
+STEP_M = 0.5
+BEHIND_M = 90.0
+AHEAD_M = 190.0
+MARK_SOLID, MARK_DASHED, MARK_DOUBLE, MARK_HATCHED = range(4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Centreline:
+    """Main street: ``s`` metres along, world ``x``, ``y``, ``heading`` radians; evenly spaced samples."""
+
+    s: Array
+    x: Array
+    y: Array
+    heading: Array
+
+    def to_world(self, s: Array | float, u: Array | float) -> tuple[Array, Array, Array]:
+        """World x, y and heading of street coordinates (``u`` metres to the left of the centreline)."""
+        x, y = np.interp(s, self.s, self.x), np.interp(s, self.s, self.y)
+        heading = np.interp(s, self.s, self.heading)
+        return x - np.sin(heading) * u, y + np.cos(heading) * u, heading
+
+    def point(self, s: float, u: float) -> tuple[float, float, float]:
+        """The same for one point, without array overhead; ``s`` is clamped to the street."""
+        at = min(max((s - float(self.s[0])) / STEP_M, 0.0), len(self.s) - 1.001)
+        i = int(at)
+        f = at - i
+        heading = float(self.heading[i] + f * (self.heading[i + 1] - self.heading[i]))
+        x = float(self.x[i] + f * (self.x[i + 1] - self.x[i]))
+        y = float(self.y[i] + f * (self.y[i + 1] - self.y[i]))
+        return x - np.sin(heading) * u, y + np.cos(heading) * u, heading
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossing:
+    """A straight street through (x, y) with heading ``yaw``; (a, b) = along and left of it; ``a`` in [start, end]."""
+
+    s: float
+    x: float
+    y: float
+    yaw: float
+    half_width: float
+    sidewalk: float
+    corner: float
+    start: float
+    end: float
+
+    def has_arm(self, side: int) -> bool:
+        """Whether the street goes on to the left (+1) or right (-1) of the main street."""
+        return self.end > 0 if side > 0 else self.start < 0
+
+    def to_world(self, a: float, b: float) -> tuple[float, float]:
+        """World x, y of crossing coordinates."""
+        c, n = np.cos(self.yaw), np.sin(self.yaw)
+        return self.x + c * a - n * b, self.y + n * a + c * b
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreetPlan:
+    """Everything about the streets that other parts of the generator need. Lateral positions are street coordinates."""
+
+    line: Centreline
+    urban: bool
+    lane_width: float
+    forward_lanes: tuple[float, ...]
+    backward_lanes: tuple[float, ...]
+    ego_u: float
+    left: float
+    right: float
+    park_left: float
+    park_right: float
+    sidewalk_left: float
+    sidewalk_right: float
+    paved_left: bool
+    paved_right: bool
+    crossing: Crossing | None
+    marks: Array  # [k, 6] u, half width, period, dash, kind, yellow
+    crosswalks: Array  # [c, 3] start, length, on the crossing street
+    drive_s: Array  # street position of the vehicle at drive_times_s
+    drive_times_s: Array
+    drive_length: float
+
+    def kerb(self, side: int) -> float:
+        """Lateral position of the kerb; side +1 left, -1 right."""
+        return self.left if side > 0 else self.right
+
+    def sidewalk(self, side: int) -> float:
+        """Width of the sidewalk."""
+        return self.sidewalk_left if side > 0 else self.sidewalk_right
+
+    def ego_s(self, times_s: Array | float) -> Array:
+        """Street position of the recording vehicle."""
+        return np.interp(times_s, self.drive_times_s, self.drive_s)
+
+
+def plan_streets(config: CityConfig) -> StreetPlan:
+    """Draw the street plan of a configuration."""
+    rng = seeds.numpy_rng(config.seed, 0, "city streets")
+    urban = config.style == "urban" or (config.style == "auto" and rng.random() < 0.6)
+    times, drive_s = _drive(rng, config)
+    drive_length = float(np.interp((config.n_frames - 1) / config.rate_hz, times, drive_s))
+    lane = float(rng.uniform(3.2, 3.6))
+    lanes = _lanes(rng, urban)
+    half, park_left, park_right = lanes.median / 2, lanes.park_left, lanes.park_right
+    forward_u = tuple(-(half + (i + 0.5) * lane) for i in range(lanes.forward))
+    backward_u = tuple(half + (i + 0.5) * lane for i in range(lanes.backward))
+    left = half + lanes.backward * lane + park_left + (rng.uniform(0.3, 0.6) if not park_left else 0.0)
+    right = -(half + lanes.forward * lane + park_right + (rng.uniform(0.3, 1.0) if not park_right else 0.0))
+    ego_u = forward_u[lanes.ego]
+    line = _centreline(rng, drive_length, ego_u, urban)
+    walks = [float(rng.uniform(2.6, 5.2)) if urban else float(rng.uniform(1.7, 3.2)) for _ in range(2)]
+    crossing = _crossing(rng, config, line, drive_length, urban)
+    marks = _paint(rng, lanes, lane, (left, right))
+    crosswalks = _crosswalks(rng, (left, right), crossing)
+    return StreetPlan(
+        line, urban, lane, forward_u, backward_u, ego_u, float(left), float(right), park_left, park_right,
+        walks[0], walks[1], urban or rng.random() < 0.1, urban or rng.random() < 0.1, crossing, marks, crosswalks,
+        drive_s, times, drive_length,
+    )  # fmt: skip
+
+
+def _drive(rng: np.random.Generator, config: CityConfig) -> tuple[Array, Array]:
+    """Street position over time: a mean speed with smooth changes, braking or pulling away in some logs."""
+    duration = (config.n_frames - 1) / config.rate_hz
+    times = np.arange(-20, int(round((duration + 1.0) * 20)) + 1) * 0.05
+    mean = rng.uniform(4.5, 11.5)
+    wave = rng.uniform(0.05, 0.25) * np.sin(2 * np.pi * times / rng.uniform(4, 9) + rng.uniform(0, 6.28))
+    trend = rng.choice([0.0, -0.35, 0.35], p=[0.5, 0.25, 0.25]) * np.clip(times / max(duration, 1.0), 0, 1)
+    speed = np.maximum(mean * (1 + wave + trend), 0.5)
+    s = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * 0.05)])
+    return times, s - np.interp(0.0, times, s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Lanes:
+    """Lanes in either direction, width of the median, lane of the vehicle, widths of the parking bands."""
+
+    forward: int
+    backward: int
+    median: float
+    ego: int
+    park_left: float
+    park_right: float
+
+
+def _lanes(rng: np.random.Generator, urban: bool) -> _Lanes:
+    park = float(rng.uniform(2.1, 2.4))
+    kind = rng.choice(5, p=[0.3, 0.3, 0.22, 0.06, 0.12] if urban else [0.12, 0.2, 0.38, 0.28, 0.02])
+    if kind == 0:  # two lanes each way, driving on the outer one
+        return _Lanes(2, int(rng.integers(1, 3)), 0.0, 1, park * (rng.random() < 0.7), 0.0)
+    if kind == 1:  # wide median, driving on the inner lane, cars parked on both sides
+        return _Lanes(2, int(rng.integers(1, 3)), float(rng.uniform(2.9, 3.4)), 0, park * (rng.random() < 0.7), park)
+    if kind == 2:  # one lane each way with a painted median
+        return _Lanes(1, 1, float(rng.uniform(2.9, 3.4)), 0, park * (rng.random() < 0.8), 0.0)
+    if kind == 3:  # plain two-lane street
+        return _Lanes(1, 1, 0.0, 0, park, 0.0)
+    return _Lanes(3, 0, 0.0, 1, park, park)  # one-way street
+
+
+def _centreline(rng: np.random.Generator, drive_length: float, ego_u: float, urban: bool) -> Centreline:
+    s = np.arange(-BEHIND_M, drive_length + AHEAD_M + STEP_M, STEP_M)
+    heading = np.zeros_like(s)
+    if rng.random() > 0.2:
+        shortest = 75.0 if urban else 55.0
+        for _ in range(2):
+            wavelength = rng.uniform(shortest, 170.0)
+            amplitude = rng.uniform(-1, 1) * min(0.42, wavelength / 160.0)
+            phase = rng.uniform(0, 2 * np.pi)
+            heading += amplitude * np.sin(s / wavelength + phase)
+    heading -= np.interp(0.0, s, heading)
+    x = np.concatenate([[0.0], np.cumsum(0.5 * (np.cos(heading[1:]) + np.cos(heading[:-1])) * STEP_M)])
+    y = np.concatenate([[0.0], np.cumsum(0.5 * (np.sin(heading[1:]) + np.sin(heading[:-1])) * STEP_M)])
+    # the vehicle starts at the world's origin, looking along x
+    return Centreline(s, x - np.interp(0.0, s, x), y - np.interp(0.0, s, y) - ego_u, heading)
+
+
+def _crossing(
+    rng: np.random.Generator, config: CityConfig, line: Centreline, drive_length: float, urban: bool
+) -> Crossing | None:
+    wanted = rng.random() < (0.75 if urban else 0.55)
+    if config.crossing == "no" or (config.crossing == "auto" and not wanted):
+        return None
+    s = drive_length + float(rng.uniform(20, 42)) if rng.random() < 0.7 else float(rng.uniform(15, 15 + drive_length))
+    x, y, heading = line.point(s, 0.0)
+    half = float(rng.uniform(3.4, 5.6))
+    start, end = -160.0, 160.0
+    arms = rng.random()
+    if arms < 0.2:
+        start = 0.0
+    elif arms < 0.4:
+        end = 0.0
+    yaw = heading + np.pi / 2 + rng.uniform(-0.12, 0.12)
+    return Crossing(
+        s, float(x), float(y), float(yaw), half, float(rng.uniform(1.8, 3.2)), float(rng.uniform(3, 6)), start, end
+    )
+
+
+def _paint(rng: np.random.Generator, lanes: _Lanes, width: float, kerbs: tuple[float, float]) -> Array:
+    """Lines along the main street, f64[k, 6]; see ``StreetPlan.marks``."""
+    median = lanes.median
+    yellow = float(rng.random() < 0.45)
+    half = float(rng.uniform(0.055, 0.08))
+    period, dash = float(rng.uniform(6, 12)), float(rng.uniform(2.4, 4.0))
+    rows = [[-(median / 2 + i * width), half, period, dash, MARK_DASHED, 0.0] for i in range(1, lanes.forward)]
+    rows += [[median / 2 + i * width, half, period, dash, MARK_DASHED, 0.0] for i in range(1, lanes.backward)]
+    if lanes.backward and median > 0:
+        rows += [[side * median / 2, half, 1.0, 1.0, MARK_SOLID, yellow] for side in (-1, 1)]
+        if rng.random() < 0.7:
+            rows.append([0.0, median / 2 - 0.15, 3.2, 0.55, MARK_HATCHED, yellow])
+    elif lanes.backward:
+        kind = rng.choice([MARK_DOUBLE, MARK_DASHED, MARK_SOLID])
+        rows.append([0.0, half, period, dash, float(kind), yellow])
+    edge = rng.random() < 0.6
+    for kerb, park in zip(kerbs, (lanes.park_left, lanes.park_right), strict=True):
+        inner = abs(kerb) - park
+        if park and rng.random() < 0.7:
+            rows.append([np.sign(kerb) * inner, half, 2.0, 1.0, MARK_DASHED, 0.0])
+        elif not park and edge:
+            rows.append([np.sign(kerb) * (inner - 0.25), half, 1.0, 1.0, MARK_SOLID, 0.0])
+    return np.array(rows, np.float64).reshape(-1, 6)
+
+
+def _crosswalks(rng: np.random.Generator, kerbs: tuple[float, float], crossing: Crossing | None) -> Array:
+    """f64[c, 3]; see ``StreetPlan.crosswalks``."""
+    left, right = kerbs
+    walks: list[list[float]] = []
+    length = float(rng.uniform(2.8, 4.0))
+    if crossing is not None:
+        clear = crossing.corner * 0.6 + 1.0
+        gap = crossing.half_width + crossing.corner * 0.6 + 1.0
+        walks.append([crossing.s - gap - length, length, 0.0])
+        walks.append([crossing.s + gap, length, 0.0])
+        if crossing.has_arm(1):
+            walks.append([left + clear, length, 1.0])
+        if crossing.has_arm(-1):
+            walks.append([right - clear - length, length, 1.0])
+    elif rng.random() < 0.6:
+        walks.append([float(rng.uniform(14, 55)), length, 0.0])
+    return np.array(walks, np.float64).reshape(-1, 3)

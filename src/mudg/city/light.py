@@ -1,0 +1,172 @@
+"""Sun, sky, weather and camera response of a generated city."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import seeds
+from mudg.city import objects as rec
+from mudg.city.config import CityConfig
+from mudg.core.weather.gbuffer import Surroundings
+from mudg.core.weather.ground import noise_seed
+from mudg.core.weather.light import LAMP_POWER, FilmicResponse
+from mudg.core.weather.noise import patch_threshold
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sky:
+    """Radiances f64[3] of sun, zenith, horizon, ambient light and clouds; share of clouds; elevation of the sun in radians."""
+
+    sun: Numbers
+    zenith: Numbers
+    horizon: Numbers
+    ambient: Numbers
+    cloud: Numbers
+    cloudiness: float
+    elevation: float
+
+
+def _other_sky(rng: np.random.Generator, plain: Sky) -> Sky:
+    """The sky of a photograph: often so bright that the camera saturates. Ground and sky are exposed independently."""
+    kind = int(rng.choice(7, p=[0.14, 0.22, 0.16, 0.16, 0.16, 0.10, 0.06]))
+    bright = rng.uniform(0.9, 2.6)
+    warm = 1 + rng.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
+    if kind == 0:  # as it was, only brighter or darker
+        k = rng.uniform(0.7, 1.8)
+        return replace(plain, zenith=plain.zenith * k, horizon=plain.horizon * k, cloud=plain.cloud * k)
+    if kind == 1:  # white all over, near saturation
+        white = np.array([0.97, 1.0, 1.03]) * warm * bright * rng.uniform(1.0, 1.8)
+        return replace(plain, sun=plain.sun * rng.uniform(0, 0.15), zenith=white * rng.uniform(0.75, 1.05),
+                       horizon=white, cloud=white * 0.95,
+                       ambient=np.array([0.95, 1.0, 1.06]) * rng.uniform(0.7, 1.3), cloudiness=rng.uniform(0.0, 1.0))  # fmt: skip
+    if kind == 2:  # graded blue, pale at the horizon
+        deep = np.array([rng.uniform(0.08, 0.4), rng.uniform(0.3, 0.62), rng.uniform(0.75, 1.2)])
+        return replace(plain, zenith=deep * rng.uniform(0.6, 1.3), horizon=np.array([0.85, 0.95, 1.05]) * warm * rng.uniform(0.8, 1.8),
+                       cloudiness=rng.uniform(0, 0.25))  # fmt: skip
+    if kind == 3:  # scattered bright clouds
+        deep = np.array([rng.uniform(0.15, 0.35), rng.uniform(0.4, 0.55), rng.uniform(0.8, 1.1)])
+        return replace(plain, zenith=deep, horizon=np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1.5), cloudiness=rng.uniform(0.35, 1.1),
+                       cloud=np.array([1.0, 1.0, 1.02]) * warm * bright)  # fmt: skip
+    if kind == 4:  # haze: white below, bluish above
+        white = np.array([1.0, 1.0, 1.0]) * warm * bright
+        blue = np.array([0.55, 0.72, 0.95]) * bright
+        return replace(plain, horizon=white * 1.2, zenith=blue, cloud=white, cloudiness=rng.uniform(0.1, 0.6))
+    if kind == 5:  # low sun
+        glow = np.array([1.5, rng.uniform(0.7, 1.1), rng.uniform(0.35, 0.8)]) * rng.uniform(0.8, 1.6)
+        return Sky(np.array([2.8, 1.7, 0.9]) * rng.uniform(0.4, 1.0), np.array([0.25, 0.35, 0.6]) * rng.uniform(0.8, 1.5), glow,
+                   np.array([0.55, 0.52, 0.6]) * rng.uniform(0.9, 1.4), glow * rng.uniform(0.5, 0.9), rng.uniform(0.2, 0.9),
+                   float(np.deg2rad(rng.uniform(3, 12))))  # fmt: skip
+    dark = np.array([0.42, 0.46, 0.52]) * rng.uniform(0.6, 1.2)  # before a storm
+    return replace(plain, sun=plain.sun * 0.05, zenith=dark * 0.8, horizon=dark * rng.uniform(1.0, 1.8), cloud=dark * 0.7,
+                   ambient=np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0), cloudiness=rng.uniform(0.6, 1.1))  # fmt: skip
+
+
+def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
+    """The chosen light and its numbers, in the order of ``LightNumber`` in native/city.cpp."""
+    rng = seeds.numpy_rng(config.seed, 0, "city light")
+    name = config.light
+    pick = rng.choice(["day", "overcast", "dusk"], p=[0.62, 0.24, 0.14])
+    if name == "auto":
+        name = str(pick)
+    azimuth = rng.uniform(0, 2 * np.pi)
+    tint = rng.uniform(0.96, 1.04, 3)
+    if name == "night":
+        elevation = 1.0
+        sun = np.zeros(3)
+        zenith, horizon = np.array([0.006, 0.006, 0.0072]), np.array([0.039, 0.0306, 0.0252])
+        ambient, cloud = np.array([0.0096, 0.0102, 0.012]), np.array([0.02, 0.02, 0.02])
+        cloudiness, haze, night, exposure = rng.uniform(0.0, 0.6), rng.uniform(600, 1600), 1.0, rng.uniform(0.9, 1.3)
+    elif name == "day":
+        elevation = np.deg2rad(rng.uniform(18, 62))
+        sun = np.array([3.3, 3.05, 2.65]) * rng.uniform(0.85, 1.15)
+        zenith, horizon = np.array([0.20, 0.40, 0.86]) * rng.uniform(0.8, 1.1), np.array([0.66, 0.80, 0.98])
+        ambient, cloud = np.array([0.78, 0.88, 1.06]) * rng.uniform(0.85, 1.15), np.array([1.25, 1.25, 1.27])
+        cloudiness, haze, night, exposure = rng.uniform(0.0, 0.95), rng.uniform(400, 1600), 0.0, rng.uniform(0.50, 0.72)
+    elif name == "overcast":
+        elevation = np.deg2rad(rng.uniform(30, 60))
+        sun = np.array([0.30, 0.30, 0.30]) * rng.uniform(0.0, 1.0)
+        zenith, horizon = np.array([0.80, 0.84, 0.92]) * rng.uniform(0.8, 1.1), np.array([1.02, 1.04, 1.08])
+        ambient, cloud = np.array([1.0, 1.03, 1.1]) * rng.uniform(0.9, 1.1), np.array([0.86, 0.87, 0.90])
+        cloudiness, haze, night, exposure = rng.uniform(0.6, 1.1), rng.uniform(350, 1400), 0.05, rng.uniform(0.75, 1.0)
+    else:
+        elevation = np.deg2rad(rng.uniform(3.0, 9.0))
+        azimuth = rng.uniform(0.35, 2 * np.pi - 0.35)
+        sun = np.array([2.6, 1.45, 0.68]) * rng.uniform(0.5, 1.1)
+        zenith, horizon = np.array([0.20, 0.27, 0.50]) * rng.uniform(0.8, 1.2), np.array([1.05, 0.68, 0.45])
+        ambient, cloud = np.array([0.40, 0.42, 0.56]) * rng.uniform(0.85, 1.2), np.array([0.86, 0.58, 0.50])
+        cloudiness, haze, night, exposure = rng.uniform(0.1, 0.8), rng.uniform(250, 900), 0.6, rng.uniform(0.85, 1.25)
+    if config.skies == "varied":
+        plain = Sky(sun, zenith, horizon, ambient, cloud, cloudiness, float(elevation))
+        sky = _other_sky(seeds.numpy_rng(config.seed, 0, "city sky"), plain)
+        sun, zenith, horizon, ambient, cloud, cloudiness, elevation = (getattr(sky, name) for name in Sky.__slots__)
+    if config.fog_visibility_m > 0:
+        haze = config.fog_visibility_m / 3.0
+    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    numbers = [
+        *direction, *sun, *zenith, *horizon, *ambient, *cloud, *tint, cloudiness, haze, night, exposure,
+        rng.uniform(0.95, 1.08), rng.uniform(0.85, 1.08), rng.uniform(0.003, 0.009), rng.uniform(0.05, 0.3), 0.0035,
+    ]  # fmt: skip
+    return name, np.array(numbers, np.float64)
+
+
+# weather --------------------------------------------------------------------------------------------------------------
+#
+# Wet ground, snow and street lamps of a generated city: the numbers its ray caster needs, by the same rules as ``mudg.core.weather``.
+
+
+def weather_numbers(config: CityConfig) -> NDArray[np.float64] | None:
+    """Numbers in the order of ``mudg_city_set_weather`` in native/city_weather.cpp; None in a city that needs none."""
+    night = config.light == "night"
+    if not (config.wet or config.snow_cover or night):
+        return None
+    puddles, snow = (noise_seed(config.seed, purpose) for purpose in ("puddles", "snow"))
+    snow_level = patch_threshold(config.snow_cover, snow) if config.snow_cover else 2.0
+    return np.array(
+        [config.wet, patch_threshold(config.puddles, puddles), puddles, snow_level, snow, LAMP_POWER if night else 0.0]
+    )
+
+
+def lamp_places(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    """World places f64[N, 3] of the lights of all street lamps among the city's records."""
+    places = []
+    for row in rows:
+        if int(row[0]) != rec.LAMP:
+            continue
+        x, y, z, yaw, height, arm, globe = *row[1:5], row[7], row[15], row[16] > 0.5
+        out, up = (0.0, 0.2) if globe else (arm + 0.3, 0.36)
+        places.append((x + out * math.cos(yaw), y + out * math.sin(yaw), z + height + up))
+    return np.array(places, np.float64).reshape(-1, 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CityLight:
+    """Exact light and camera of a generated city: what an edit of its images could know at best.
+
+    Args:
+        surroundings: sun, sky, airlight and lamps, the road at height 0.
+        response: the camera.
+        visibility_m: in the haze.
+    """
+
+    surroundings: Surroundings
+    response: FilmicResponse
+    visibility_m: float
+
+
+def city_light(config: CityConfig, lamps: NDArray[np.float64] | None = None) -> CityLight:
+    """The light of a city with a plain sky and no photographs; ``lamps`` are those of ``CityWorld.lamps``."""
+    _, n = light_numbers(config)
+    direction, sun, zenith, horizon, ambient, _cloud, white = n[:21].reshape(7, 3)
+    haze_m, _night, exposure, contrast, saturation, _noise, vignette = n[22:29]
+    airlight = 0.875 * horizon + 0.075 * ambient
+    around = Surroundings(horizon, zenith, ambient, sun, direction, airlight, 0.0, lamps)
+    r, g, b = (float(w) for w in white)
+    response = FilmicResponse(float(exposure), (r, g, b), float(saturation), float(contrast), float(vignette))
+    return CityLight(around, response, 3.0 * float(haze_m))

@@ -1,0 +1,198 @@
+"""Whole generated logs for scoring scenes off the recorded path, in two lists; no model was ever trained on them.
+
+A list is not picked by eye: `choose` walks the seeds upwards and keeps what satisfies `LogChoice`. In 2.3 s the generator's
+streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so that "curved" means 5 degrees
+here, and half of each list is curved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Container
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log
+from mudg.base.errors import UsageError
+from mudg.base.types import Scene, View
+from mudg.city.config import CityConfig
+from mudg.city.layout import plan_streets
+from mudg.city.traffic import ego_keys
+from mudg.city.world import CityWorld
+from mudg.core.fusion import FusionRules, judge_track
+from mudg.scene.write import SceneWriter
+
+# records a generated city as a scene directory ------------------------------------------------------------------------
+
+
+SENSOR = "lidar"
+
+
+def write_city(config: CityConfig, out_dir: Path | str, *, test_every: int = 4) -> Scene:
+    """Generate the log of ``config`` and write it, as lossless PNG, with its exact labels (depth, semantics, sky, dynamic, instance).
+
+    All cores work: the rays of a frame on the native threads, encoding and writing on the writer's. The scene is moved
+    into place when it is complete; an interrupted call leaves nothing, and the same call makes the same bytes again.
+
+    Args:
+        config: the city and its log.
+        out_dir: destination; must not hold a scene yet.
+        test_every: hold out every n-th frame of all cameras (n, 2n, ...; never the first); 0 = none.
+
+    Returns:
+        The scene, read back.
+
+    Raises:
+        ResourceError: no native library, or the folder cannot be written. InputError: there is a scene here already.
+        UsageError: ``test_every`` is negative.
+    """
+    if test_every < 0:
+        raise UsageError("test_every cannot be negative", got=str(test_every))
+    world = CityWorld(config)
+    log.info(f"city {config.seed}: {world.describe()}")
+    return write_world(world, out_dir, test_every)
+
+
+def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> Scene:
+    """As ``write_city``, of a world that is there, such as one with objects elsewhere (``CityWorld.rearranged``)."""
+    config = world.config
+    moving = np.array([0, *(int(posed.moving) for posed in world.objects)], bool)
+    split: dict[str, str] = {}
+    with SceneWriter(out_dir, f"city-{config.seed}", world.source()) as writer:
+        for camera in world.cameras().values():
+            writer.add_camera(camera)
+        writer.set_ego(world.ego_path())
+        for track in world.tracks():
+            writer.add_track(track)
+        views = {name: world.frame_views(name) for name in config.cameras}
+        with log.task("recording the city", config.n_frames * (len(views) + 1)) as progress:
+            for index in range(config.n_frames):
+                held_out = test_every > 0 and index > 0 and index % test_every == 0
+                for name in config.cameras:
+                    frame_id = f"{name}/{index:06d}"
+                    _write_frame(writer, world, frame_id, views[name][index], moving)
+                    split[frame_id] = "test" if held_out else "train"
+                    progress.advance()
+                sweep = world.lidar_sweep(index)
+                writer.add_sweep(f"{SENSOR}/{index:06d}", SENSOR, sweep.time_s, sweep.world_from_lidar, sweep.points)
+                progress.advance()
+        writer.set_split(split)
+        return writer.finish()
+
+
+def _write_frame(writer: SceneWriter, world: CityWorld, frame_id: str, view: View, moving: NDArray[np.bool_]) -> None:
+    truth = world.render(view, sensor_noise=world.config.sensor_noise)
+    labels = {
+        "depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky, "dynamic": moving[truth.instance],
+        "instance": truth.instance,
+    }  # fmt: skip
+    writer.add_frame(frame_id, view, truth.rgb_u8, labels)
+
+
+# logs -----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LogRules:
+    """What a log is recorded with: frames at 10 Hz, image size in pixels, and the cameras; the LiDAR is the standard one."""
+
+    frames: int = 24
+    width: int = 384
+    height: int = 256
+    cameras: tuple[str, ...] = ("front", "front_left", "front_right")
+
+
+@dataclass(frozen=True)
+class LogChoice:
+    """Which logs enter a list.
+
+    Args:
+        moving: at least so many moving vehicles are in view of the front camera.
+        smallest_share: in view means: covers this share of the image,
+        frames_share: in this share of the frames.
+        curved_deg: half of the list turns by at least this angle.
+    """
+
+    moving: int = 2
+    smallest_share: float = 1e-3
+    frames_share: float = 0.25
+    curved_deg: float = 5.0
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front camera, the
+    share of the image they cover together on average, and the generator's line about the city."""
+
+    seed: int
+    turn_deg: float
+    length_m: float
+    moving: int
+    moving_share: float
+    description: str
+
+
+STANDARD: Final = LogRules()
+CHOICE: Final = LogChoice()
+VEHICLES: Final = frozenset({"car", "truck", "bus", "cyclist"})
+
+DEVELOPMENT: tuple[int, ...] = (2100000, 2100001, 2100004, 2100007)
+"""Logs to look at while choosing: the first that `choose` finds from the first of them on."""
+REPORTED: tuple[int, ...] = (2100100, 2100101, 2100102, 2100103, 2100151, 2100154, 2100157, 2100242)
+"""Logs whose scores are reported and on which nothing is chosen; found in the same way."""
+LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
+
+
+def log_config(seed: int, rules: LogRules = STANDARD) -> CityConfig:
+    """The generator's configuration of a log."""
+    plain = CityConfig(seed=seed, n_frames=rules.frames, width=rules.width, height=rules.height)
+    return dataclasses.replace(plain, cameras=rules.cameras)
+
+
+def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> tuple[int, ...]:
+    """Instance ids of the objects that move during the log, by the test that also separates their clouds; `labels`: which count."""
+    rules = FusionRules()
+    moving = (t for t in world.tracks() if (labels is None or t.label in labels) and judge_track(t, rules).moving)
+    return tuple(world.instance_of(track.id) for track in moving)
+
+
+def facts(seed: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> LogFacts:
+    """What the log of a seed holds, from small images of every fourth frame."""
+    world = CityWorld(log_config(seed, rules))
+    views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
+    seen = np.stack([world.render(view, supersample=1).instance for view in views])
+    moving = moving_instances(world, VEHICLES)
+    shares = np.array([[float((image == i).mean()) for image in seen] for i in moving]).reshape(-1, len(views))
+    count = int(((shares >= choice.smallest_share).mean(1) >= choice.frames_share).sum())
+    share = float(shares.sum(0).mean())
+    return LogFacts(seed, turn_deg(world.config), world.plan.drive_length, count, share, world.describe())
+
+
+def turn_deg(config: CityConfig) -> float:
+    """Range of the vehicle's headings over a log, degrees."""
+    times, poses = ego_keys(config, plan_streets(config))
+    driven = (times >= 0) & (times <= (config.n_frames - 1) / config.rate_hz)
+    heading = np.unwrap(np.arctan2(poses[driven, 1, 0], poses[driven, 0, 0]))
+    return float(np.rad2deg(heading.max() - heading.min()))
+
+
+def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> tuple[int, ...]:
+    """The first seeds from `first_seed` on that satisfy the choice: half of `count` curved, the others not, in ascending order.
+
+    Raises:
+        UsageError: `count` is odd or not positive.
+    """
+    if count <= 0 or count % 2:
+        raise UsageError("half of a list of logs is curved", expected="an even, positive number", got=str(count))
+    kept: dict[bool, list[int]] = {True: [], False: []}
+    seed = first_seed
+    while min(map(len, kept.values())) < count // 2:
+        curved = turn_deg(log_config(seed, rules)) >= choice.curved_deg
+        if len(kept[curved]) < count // 2 and facts(seed, rules, choice).moving >= choice.moving:
+            kept[curved].append(seed)
+        seed += 1
+    return tuple(sorted(kept[True] + kept[False]))

@@ -1,0 +1,473 @@
+"""A generated city with exact truth at any view and time of its log.
+
+Needs the native library: without it, building a world raises ResourceError naming the remedy (there is no slow twin).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, seeds
+from mudg.base.config import build, to_dict
+from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
+from mudg.base.types import Camera, EgoPath, Observation, Source, SweepPoints, Track, View
+from mudg.city import objects as rec
+from mudg.city import paint
+from mudg.city import sensors as rig
+from mudg.city.config import CityConfig
+from mudg.city.furnish import furnish
+from mudg.city.layout import StreetPlan, plan_streets
+from mudg.city.light import lamp_places, light_numbers, weather_numbers
+from mudg.city.native import CityHandle
+from mudg.city.photos import draw_photos
+from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
+
+DATASET = "mudg procedural city"
+GENERATOR_VERSION = 1
+FAR_BELOW_M = 1000.0
+"""How far below the street what was taken away stands: nobody sees it there, and it shades nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CityTruth:
+    """Exact truth at a view. Depth, semantics and instance belong to the ray through the pixel's centre; rgb is averaged
+    over the pixel.
+
+    Args:
+        rgb: f32[H, W, 3], display values in [0, 1].
+        depth: f32[H, W], camera z in metres, +inf in the sky.
+        semantics: u8[H, W], Cityscapes train ids.
+        instance: i32[H, W], id of a vehicle or person (see ``CityWorld.tracks``), 0 = none.
+    """
+
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    semantics: NDArray[np.uint8]
+    instance: NDArray[np.int32]
+
+    @property
+    def rgb_u8(self) -> NDArray[np.uint8]:
+        """u8[H, W, 3]."""
+        return (self.rgb * 255.0 + 0.5).astype(np.uint8)
+
+    @property
+    def sky(self) -> NDArray[np.bool_]:
+        """bool[H, W]: no depth here."""
+        return ~np.isfinite(self.depth)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CitySurfaces:
+    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W, 3]; and f32[H, W]
+    in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing water."""
+
+    normal: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    openness: NDArray[np.float32]
+    sunlit: NDArray[np.float32]
+    snow: NDArray[np.float32]
+    water: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CitySweep:
+    """One turn of the LiDAR with its truth. ``points`` are in the LiDAR frame at ``time_s``, compensated for the motion of
+    the recording vehicle (each point was measured at ``time_s + dt_s``; moving objects are where they were then).
+    ``semantics`` u8[N] and ``instance`` i32[N] belong to the points."""
+
+    time_s: float
+    world_from_lidar: NDArray[np.float64]
+    points: SweepPoints
+    semantics: NDArray[np.uint8]
+    instance: NDArray[np.int32]
+
+
+class CityWorld:
+    """The world of one configuration. Immutable; ``render`` may be called from several threads.
+
+    Raises:
+        ResourceError: the native library is missing.
+    """
+
+    def __init__(self, config: CityConfig) -> None:
+        self.config = config
+        self.plan: StreetPlan = plan_streets(config)
+        self.light_name, self._light = light_numbers(config)
+        self._ego_times, self._ego_poses = ego_keys(config, self.plan)
+        self.objects: tuple[PosedObject, ...] = tuple(plan_traffic(config, self.plan, self._ego_times, self._ego_poses))
+        self._key_times = key_times(config)
+        self._furniture = furnish(config, self.plan)
+        self.lamps: NDArray[np.float64] = lamp_places(self._furniture + [m.row for m in self.objects])
+        no_keys = np.zeros((len(self._key_times), 0, 4))
+        self._keys = np.stack([m.keys for m in self.objects], 1) if self.objects else no_keys
+        self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
+        self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
+        self._handle = self._native_world()
+        self._cameras = rig.cameras(config)
+        self._mounts = rig.ego_from_camera(config)
+        self._ego_path = EgoPath(self._ego_times, self._ego_poses)
+
+    def _native_world(self) -> CityHandle:
+        """The native world of all shapes, in its light and weather."""
+        config = self.config
+        records = np.array(self._furniture + [m.row for m in self.objects], np.float64).reshape(-1, rec.COLUMNS)
+        handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), self._light, _seed31(config, "city surfaces"))
+        for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
+            handle.set_texture(slot, rgb, metres)
+        numbers = weather_numbers(config)
+        if numbers is not None:
+            handle.set_weather(numbers, self.lamps)
+        return handle
+
+    @classmethod
+    def from_source(cls, source: Source) -> CityWorld:
+        """Rebuild the world a scene was recorded in, bit for bit, from the recipe in its ``source``.
+
+        Raises:
+            InputError: the source holds no recipe of this generator.
+        """
+        recipe = source.recipe
+        if recipe is None or "city" not in recipe:
+            raise InputError("the scene was not generated, so there is no exact truth", where="source.recipe",
+                got=source.dataset)  # fmt: skip
+        if recipe.get("generator_version") != GENERATOR_VERSION:
+            raise InputError("the scene was made by another version of the generator",
+                where="source.recipe.generator_version", expected=str(GENERATOR_VERSION),
+                got=str(recipe.get("generator_version")), remedy="generate it again")  # fmt: skip
+        if not isinstance(recipe["city"], Mapping):
+            raise InputError("the recipe of a generated city is no object", where="source.recipe.city", got=str(recipe["city"]))
+        try:
+            return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
+        except UsageError as error:  # nobody asked for these settings: a file states them
+            raise InputError(error.what, where=error.where, expected=error.expected, got=error.got, remedy="generate it again") from error
+
+    def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
+        """The same world, light and shadows included, with some vehicles or people elsewhere or gone.
+
+        Args:
+            keys: track id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not there.
+        """
+        moved = self._keys.copy()
+        for track_id, values in keys.items():
+            index = self._index_of(track_id)
+            if values is None:
+                moved[:, index, 2] = -FAR_BELOW_M
+            else:
+                moved[:, index] = values
+        other = copy.copy(self)
+        other._keys = moved
+        return other
+
+    def _index_of(self, track_id: str) -> int:
+        known = [track.id for track in self.tracks()]
+        if track_id not in known:
+            raise UsageError("the city has no such object", expected=", ".join(known), got=track_id)
+        return known.index(track_id)
+
+    def recast(self, track_id: str, look: PosedObject) -> CityWorld:
+        """The same world, light and shadows included, with another object on the path of a vehicle or person.
+
+        Args:
+            look: whose shape, size and paint it gets, for example an object of another world.
+
+        Raises:
+            UsageError: the city has no such object.
+        """
+        index = self._index_of(track_id)
+        mine = self.objects[index]
+        objects = list(self.objects)
+        objects[index] = PosedObject([*look.row[:-1], mine.row[-1]], mine.keys, look.gait_rad_per_s, mine.moving)
+        other = copy.copy(self)
+        other.objects = tuple(objects)
+        other._gaits = np.array([m.gait_rad_per_s for m in objects], np.float64)
+        other._handle = other._native_world()
+        return other
+
+    @property
+    def key_times_s(self) -> NDArray[np.float64]:
+        """Times f64[K] of the keys of all objects."""
+        return self._key_times
+
+    def source(self) -> Source:
+        """What a scene of this world records about its origin."""
+        recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
+        return Source(DATASET, "CC0-1.0", recipe, (f"generated city, light: {self.light_name}",))
+
+    # --- facts ------------------------------------------------------------------------------------------------------
+
+    def describe(self) -> str:
+        """One line about what was drawn."""
+        plan = self.plan
+        lanes = f"{len(plan.forward_lanes)}+{len(plan.backward_lanes)} lanes"
+        quarter = "urban" if plan.urban else "suburban"
+        crossing = "a crossing" if plan.crossing is not None else "no crossing"
+        moving = sum(m.moving for m in self.objects)
+        return (
+            f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving and "
+            f"{len(self.objects) - moving} standing objects, {self.shape_count} shapes"
+        )
+
+    @property
+    def shape_count(self) -> int:
+        """Number of primitive shapes in the world."""
+        return self._handle.shape_count
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last time that can be rendered."""
+        return float(self._key_times[0]), float(self._key_times[-1])
+
+    def frame_time(self, index: int) -> float:
+        """Time of a frame in seconds."""
+        return index / self.config.rate_hz
+
+    def cameras(self) -> dict[str, Camera]:
+        """The recorded cameras."""
+        return {name: self._cameras[name] for name in self.config.cameras}
+
+    def ego_path(self) -> EgoPath:
+        """Poses of the vehicle, four keys per frame and half a frame beyond both ends; what ``pose_at`` interpolates is
+        the truth the LiDAR was simulated with."""
+        return self._ego_path
+
+    def tracks(self) -> tuple[Track, ...]:
+        """Boxes of all vehicles and people, parked ones with a constant pose. The number in the id is the instance id.
+        Truth between keys is exactly ``Track.pose_at``."""
+        tracks = []
+        for index, posed in enumerate(self.objects):
+            label = rec.LABELS[int(posed.row[0])]
+            half = posed.size[2] / 2
+            poses = np.stack([geometry.yaw_matrix(float(yaw), (x, y, z + half)) for x, y, z, yaw in posed.keys])
+            tracks.append(Track(f"{label}-{index + 1:03d}", label, np.array(posed.size), self._key_times, poses))
+        return tuple(tracks)
+
+    def instance_of(self, track_id: str) -> int:
+        """Instance id of a track."""
+        return int(track_id.rsplit("-", 1)[1])
+
+    def frame_views(self, camera: str) -> tuple[View, ...]:
+        """The recorded views of a camera, one per frame."""
+        if camera not in self._cameras:
+            raise UsageError("the city has no such camera", expected=", ".join(self._cameras), got=camera)
+        views = []
+        for index in range(self.config.n_frames):
+            time_s = self.frame_time(index)
+            views.append(View(self._cameras[camera], self._world_from_ego(time_s) @ self._mounts[camera], time_s))
+        return tuple(views)
+
+    def frame_pose(self, time_s: float) -> NDArray[np.float64]:
+        """world_from_ego f64[4, 4] of the recording vehicle; UsageError outside the log."""
+        return self._world_from_ego(time_s)
+
+    def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
+        pose = self._ego_path.pose_at(time_s)
+        if pose is None:
+            raise UsageError("time lies outside the log",
+                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")  # fmt: skip
+        return pose
+
+    def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x, y, z, yaw f64[T, objects, 4] between the keys, as Track.pose_at interpolates."""
+        times, keys = self._key_times, self._keys
+        first, last = self.span_s
+        if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
+            raise UsageError("time lies outside the log", expected=f"{first:.3f}..{last:.3f} s",
+                got=f"{times_s.min()}..{times_s.max()} s")  # fmt: skip
+        at = np.clip((times_s - first) * self.config.rate_hz, 0, len(times) - 1)
+        nearest = np.rint(at)
+        at = np.where(np.abs(at - nearest) < 1e-6 * self.config.rate_hz, nearest, at)
+        before = np.minimum(at.astype(int), len(times) - 2)
+        u = (at - before)[:, None, None]
+        return keys[before] + u * (keys[before + 1] - keys[before])
+
+    def _phases(self, time_s: float) -> NDArray[np.float64]:
+        return self._gait_starts + self._gaits * time_s
+
+    def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
+        """Pixels bool[H, W] whose centre shows paint on the road, exactly: without the blur of a pixel and without wear.
+
+        Args:
+            truth: what ``render`` gave for this view.
+        """
+        rows, columns = np.nonzero((truth.semantics == ID["road"]) & ~truth.sky)
+        xyz = geometry.unproject(view, np.stack([columns, rows], 1) + 0.5, truth.depth[rows, columns])
+        mask = np.zeros(truth.semantics.shape, bool)
+        if len(xyz):
+            mask[rows, columns] = paint.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
+        return mask
+
+    def lane_lines(self) -> list[NDArray[np.float64]]:
+        """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
+        return paint.lane_lines(self.plan)
+
+    # --- truth ------------------------------------------------------------------------------------------------------
+
+    def render(self, view: View, *, supersample: int | None = None, sensor_noise: bool = False) -> CityTruth:
+        """Truth at any view whose time lies in ``span_s``.
+
+        Args:
+            view: any pinhole camera (distortion and rolling shutter are refused) at any pose.
+            supersample: rays per pixel and axis; None = the configuration's.
+            sensor_noise: add the camera noise of a recorded image; the same view gives the same noise.
+
+        Raises:
+            UsageError: time outside the log, or a camera model that is not simulated.
+        """
+        camera = view.camera
+        if camera.readout_s != 0 or any(camera.distortion):
+            raise UsageError("the city renders undistorted global-shutter cameras", where=f"camera {camera.name!r}")
+        noise_key = 0
+        if sensor_noise:
+            noise_key = seeds.key(self.config.seed, round(view.time_s * 1e4), f"city noise {camera.name}") | 1
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        per_axis = self.config.supersample if supersample is None else supersample
+        if not 1 <= per_axis <= 8:
+            raise UsageError("supersample must lie in 1..8", got=str(per_axis))
+        poses = self._object_keys_at(np.array([view.time_s]))[0]
+        return CityTruth(*self._handle.render(poses, self._phases(view.time_s), intrinsics, camera.width, camera.height,
+                                              view.world_from_cam, per_axis, noise_key))  # fmt: skip
+
+    def surfaces(self, view: View) -> CitySurfaces:
+        """Exact surfaces behind the pixel centres of a view, as ``render`` sees them."""
+        poses = self._object_keys_at(np.array([view.time_s]))[0]
+        planes = self._handle.planes(poses, self._phases(view.time_s), view.camera, view.world_from_cam)
+        return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))
+
+    def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
+        """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what ``render``
+        gave for this view already."""
+        import torch
+
+        truth = truth or self.render(view)
+        rgb = torch.from_numpy(truth.rgb).permute(2, 0, 1).contiguous()
+        depth = torch.from_numpy(np.where(truth.sky, np.float32(0), truth.depth))[None]
+        semantics = torch.from_numpy(truth.semantics.astype(np.int64))
+        ones = torch.ones((1, *semantics.shape))
+        return Observation(view, rgb, depth, semantics, ones, ones.bool(), "recorded", "city truth")
+
+    def render_rolling(self, view: View, readout_s: float, strips: int = 8) -> CityTruth:
+        """The image of a rolling shutter: vehicle and objects move while the rows are read, the middle row at the view's time.
+
+        Rows are taken in strips of one time each. Times beyond the log's span keep the pose of its end.
+        """
+        camera, parts = view.camera, []
+        mount = geometry.invert(self._world_from_ego(view.time_s)) @ view.world_from_cam
+        edges = np.linspace(0, camera.height, min(strips, camera.height) + 1).round().astype(int)
+        first, last = max(self.span_s[0], float(self._ego_times[0])), min(self.span_s[1], float(self._ego_times[-1]))
+        for top, bottom in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            at = view.time_s + readout_s * ((top + bottom) / 2 / camera.height - 0.5)
+            at = min(max(at, first), last)
+            intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy - top)
+            parts.append(self._handle.render(
+                self._object_keys_at(np.array([at]))[0], self._phases(at), intrinsics, camera.width, bottom - top,
+                self._world_from_ego(at) @ mount, self.config.supersample, 0,
+            ))  # fmt: skip
+        rgb, depth, semantics, instance = zip(*parts, strict=True)
+        return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
+
+    def lidar_sweep(self, index: int, scan: rig.LidarScan | None = None) -> CitySweep:
+        """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.
+        Vehicle and objects move during the turn; the limbs of people keep their pose of the middle. ``scan``: another LiDAR than the
+        configuration's; with a delay, points and pose are what a log has whose clock is wrong by it."""
+        config = self.config
+        if not 0 <= index < config.n_frames:
+            raise UsageError("there is no such sweep", expected=f"0..{config.n_frames - 1}", got=str(index))
+        time_s = self.frame_time(index)
+        period = 1.0 / config.rate_hz
+        azimuths = rig.lidar_azimuths(config)
+        offsets = (np.arange(len(azimuths)) + 0.5) / len(azimuths) * period - period / 2
+        knots = np.array([time_s - period / 2, time_s, time_s + period / 2])
+        scan = scan or rig.LidarScan(rig.ego_from_lidar(), rig.lidar_elevations(config))
+        mount = scan.ego_from_lidar
+        time_s += scan.delay_s
+        knots = np.clip(knots + scan.delay_s, *self.span_s)
+        world_from_lidar = self._world_from_ego(time_s) @ mount
+        columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
+        settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
+        xyz, intensity, semantics, instance = self._handle.sweep(
+            self._object_keys_at(knots), self._phases(time_s), scan.elevations_rad, azimuths, columns[:, :3],
+            (offsets + period / 2) / period, settings, seeds.key(config.seed, index, f"city lidar{scan.name}"),
+        )  # fmt: skip
+        hit = intensity >= 0
+        lidar_from_world = geometry.invert(world_from_lidar)
+        world = xyz[hit].astype(np.float64)
+        local = np.einsum("ij,nj->ni", lidar_from_world[:3, :3], world) + lidar_from_world[:3, 3]
+        dt_s = np.broadcast_to(offsets[:, None], hit.shape)[hit]
+        points = SweepPoints(local.astype(np.float32), intensity[hit], dt_s.astype(np.float32))
+        if scan.delay_s:
+            time_s -= scan.delay_s
+            world_from_lidar = self._world_from_ego(time_s) @ mount
+        return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
+
+    def kerb_distance(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance [N] of world points [N, 2] to the kerb line in metres, negative on the road."""
+        return self._handle.street(xy)[:, 2]
+
+
+def _interpolated_poses(
+    times: NDArray[np.float64], poses: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``geometry.pose_at`` for many times f64[N, 4, 4]: slerp and straight line between neighbouring keys."""
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    out = np.empty((len(at), 4, 4))
+    for i in np.unique(before):
+        rows = before == i
+        u = (at[rows] - times[i]) / (times[i + 1] - times[i])
+        q0, q1 = geometry.quaternion_from_matrix(poses[i]), geometry.quaternion_from_matrix(poses[i + 1])
+        q1 = q1 if float(q0 @ q1) >= 0 else -q1
+        angle = math.acos(min(1.0, float(q0 @ q1)))
+        if angle < 1e-6:
+            q = q0 + u[:, None] * (q1 - q0)
+        else:
+            q = (np.sin((1 - u) * angle)[:, None] * q0 + np.sin(u * angle)[:, None] * q1) / math.sin(angle)
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        w, x, y, z = q.T
+        out[rows, :3, :3] = np.stack(
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+             2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1).reshape(-1, 3, 3)  # fmt: skip
+        out[rows, :3, 3] = (1 - u)[:, None] * poses[i][:3, 3] + u[:, None] * poses[i + 1][:3, 3]
+        out[rows, 3] = (0, 0, 0, 1)
+    return out
+
+
+def _seed31(config: CityConfig, purpose: str) -> int:
+    return seeds.key(config.seed, 0, purpose) & 0x7FFFFFFF
+
+
+def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
+    """Numbers of the road in the order of ``RoadNumber`` in native/city.cpp."""
+    rng = seeds.numpy_rng(config.seed, 0, "city ground")
+    crossing = plan.crossing
+    cross = [0.0] * 10
+    if crossing is not None:
+        cross = [
+            1.0, crossing.s, crossing.x, crossing.y, crossing.yaw, crossing.half_width, crossing.corner, crossing.start,
+            crossing.end, crossing.sidewalk,
+        ]  # fmt: skip
+    grey = rng.uniform(0.045, 0.11)
+    warm = rng.uniform(-0.06, 0.06)
+    asphalt = grey * np.array([1 + warm, 1.0, 1 - warm])
+    stone = rng.uniform(0.17, 0.32)
+    pale = rng.uniform(-0.04, 0.10)
+    sidewalk = stone * np.array([1 + pale, 1.0, 1 - pale])
+    terrain = np.array([[0.075, 0.12, 0.03], [0.10, 0.135, 0.035], [0.15, 0.145, 0.05], [0.06, 0.10, 0.03]])[
+        rng.integers(4)
+    ] * rng.uniform(0.85, 1.2)
+    line = plan.line
+    pad = 75.0
+    bounds = [line.x.min() - pad, line.y.min() - pad, line.x.max() + pad, line.y.max() + pad]
+    return np.array(
+        [plan.left, plan.right, plan.sidewalk_left, plan.sidewalk_right, plan.paved_left, plan.paved_right, plan.park_left,
+         plan.park_right, *cross, plan.lane_width, float(_seed31(config, "city ground texture") % 1_000_000), *asphalt, *sidewalk,
+         *(sidewalk * rng.uniform(0.9, 1.2)), *terrain, rng.uniform(0.5, 1.6), rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0),
+         float(rng.random() < 0.3), *np.floor(bounds)], np.float64,
+    )  # fmt: skip

@@ -1,0 +1,315 @@
+"""Multi-resolution hash grids (Müller et al. 2022, "Instant neural graphics primitives"): learnt features of places in 3 or 4 dimensions.
+
+A grid has levels of growing resolution. The features of a point are, level by level, those of the corners of its cell, blended
+linearly along every axis. A level that has room for all its corners stores them in order; a finer one shares its entries by a hash of the
+corner's integer coordinates.
+
+The native op runs on float32 tensors on the CPU; ``torch_encode`` is the specification and runs everywhere. Gradients reach the
+table and, where they are asked for, the points. They do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mudg import native
+from mudg.base import log
+from mudg.base.errors import InputError, UsageError
+
+# hex planes -----------------------------------------------------------------------------------------------------------
+#
+# Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of places and times.
+#
+# The planes lie along xy, xz, yz and xt, yt, zt. The features of a place and time at one size are the product of the six bilinear values
+# there; those of the sizes are joined. All numbers are one tensor: size by size, plane by plane, ``[second axis, first axis, features]``.
+#
+# The native op runs on float32 tensors on the CPU; ``torch_look_up`` is the specification and runs everywhere. Gradients reach the planes
+# and, where they are asked for, the places. They do not depend on the number of threads.
+
+
+PLANES: Final = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+"""The two axes of each plane: x, y, z, t."""
+TIME: Final = 3
+NATIVE_FEATURES: Final = (1, 2, 4, 8, 16, 32)
+NATIVE_LEVELS: Final = 16
+
+
+@dataclass(frozen=True)
+class PlaneSizes:
+    """Sizes of the planes: ``features`` numbers per place, ``levels`` of 1, 2, 4, ... times ``space`` cells along x, y and z, ``time``
+    cells along t at every level; ``width`` of the networks."""
+
+    features: int
+    levels: int
+    space: int
+    time: int
+    width: int
+
+    @cached_property
+    def cells(self) -> tuple[tuple[int, int, int, int], ...]:
+        """Numbers along x, y, z and t, per level."""
+        return tuple((*(self.space * 2**level,) * 3, self.time) for level in range(self.levels))
+
+    @cached_property
+    def shapes(self) -> tuple[tuple[tuple[int, int], tuple[int, int, int]], ...]:
+        """Axes and shape (second axis, first axis, features) of every plane, in the order in which their numbers lie."""
+        return tuple(
+            (axes, (cells[axes[1]], cells[axes[0]], self.features)) for cells in self.cells for axes in PLANES
+        )
+
+    @cached_property
+    def numbers(self) -> int:
+        """Numbers of all planes."""
+        return sum(rows * columns * features for _, (rows, columns, features) in self.shapes)
+
+    def planes(self, numbers: Tensor) -> Iterator[tuple[tuple[int, int], Tensor]]:
+        """Axes and view ``[second axis, first axis, features]`` of every plane of a tensor ``[numbers]``; one gradient for all."""
+        parts = numbers.split([rows * columns * features for _, (rows, columns, features) in self.shapes])
+        for (axes, shape), part in zip(self.shapes, parts):
+            yield axes, part.view(shape)
+
+
+def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
+    """Features ``[N, features * levels]`` of places ``[N, 4]``, -1 to 1 along x, y, z, t.
+
+    Places outside get the features of the nearest place on the border. Differentiable once, in planes and places.
+
+    Args:
+        places: ``[N, 4]``.
+        numbers: ``[sizes.numbers]``.
+
+    Raises:
+        InputError: shapes do not fit.
+    """
+    if places.ndim != 2 or places.shape[1] != 4 or tuple(numbers.shape) != (sizes.numbers,):
+        raise InputError("planes of place and time: shapes do not fit", expected=f"places [N, 4], planes ({sizes.numbers},)",
+                         got=f"{tuple(places.shape)}, {tuple(numbers.shape)}")  # fmt: skip
+    library = native.library()
+    known = sizes.features in NATIVE_FEATURES and sizes.levels <= NATIVE_LEVELS and sizes.space > 1 and sizes.time > 1
+    fits = known and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (places, numbers))
+    if library is None or not fits or not len(places):
+        why = native.status() if library is None else f"{places.dtype} on {places.device}, {sizes.features} features"
+        log.info_once(f"planes of place and time: plain torch ({why})")
+        return torch_look_up(places, numbers, sizes)
+    return _LookUp.apply(places, numbers, sizes, library)
+
+
+def torch_look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
+    """``look_up`` in plain torch."""
+    levels: list[Tensor] = []
+    for index, (axes, plane) in enumerate(sizes.planes(numbers)):
+        at = places[None, None, :, list(axes)]
+        image = plane.permute(2, 0, 1)[None]
+        value = F.grid_sample(image, at, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
+        if index % len(PLANES):
+            levels[-1] = levels[-1] * value
+        else:
+            levels.append(value)
+    return torch.cat(levels, 1)
+
+
+class _LookUp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, places: Tensor, numbers: Tensor, sizes: PlaneSizes, library: ctypes.CDLL) -> Tensor:
+        given = places.detach().contiguous(), numbers.detach().contiguous()
+        out = torch.empty(len(places), sizes.features * sizes.levels)
+        _call_hex_planes(library, sizes, given, (out, None, None, None))
+        ctx.save_for_backward(*given)
+        ctx.sizes, ctx.library = sizes, library
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        places, numbers = ctx.saved_tensors
+        of_places = torch.zeros_like(places) if ctx.needs_input_grad[0] else None
+        of_numbers = torch.zeros_like(numbers) if ctx.needs_input_grad[1] else None
+        _call_hex_planes(ctx.library, ctx.sizes, (places, numbers), (None, upstream.contiguous(), of_numbers, of_places))
+        return of_places, of_numbers, None, None
+
+
+def _call_hex_planes(
+    library: ctypes.CDLL, sizes: PlaneSizes, given: tuple[Tensor, Tensor], rest: tuple[Tensor | None, ...]
+) -> None:
+    places, numbers = given
+    flat = [count for cells in sizes.cells for count in cells]
+    library.mudg_hex_planes.restype = ctypes.c_int
+    status = library.mudg_hex_planes(
+        _address_hex_planes(places), ctypes.c_int64(len(places)), _address_hex_planes(numbers), sizes.features, sizes.levels,
+        (ctypes.c_int32 * len(flat))(*flat), *map(_address_hex_planes, rest),
+    )  # fmt: skip
+    if status == 2:
+        raise MemoryError("the look-up in planes of place and time needs more memory than there is")
+    if status != 0:
+        raise InputError("the native library does not know such planes", got=str(sizes))
+
+
+def _address_hex_planes(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+# hash grid ------------------------------------------------------------------------------------------------------------
+
+
+_PRIMES = (1, 2654435761, 805459861, 3674653429)
+_MASK32 = (1 << 32) - 1
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """The shape of a grid.
+
+    Args:
+        dimensions: 3 or 4.
+        levels: 1 to 32.
+        features: per level: 1, 2, 4 or 8.
+        coarsest, finest: cells along an axis of the first and the last level; those between grow geometrically.
+        log2_entries: a level has at most 2 to this power entries.
+
+    Raises:
+        UsageError: a value outside these ranges.
+    """
+
+    dimensions: int
+    levels: int
+    features: int
+    coarsest: int
+    finest: int
+    log2_entries: int
+
+    def __post_init__(self) -> None:
+        fits = (
+            self.dimensions in (3, 4)
+            and 1 <= self.levels <= 32
+            and self.features in (1, 2, 4, 8)
+            and 1 <= self.coarsest <= self.finest <= 65536
+            and 4 <= self.log2_entries <= 30
+        )
+        if not fits:
+            raise UsageError(
+                "hash grid: sizes out of range", got=str(self),
+                expected="3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30 entries",
+            )  # fmt: skip
+
+    @cached_property
+    def resolutions(self) -> tuple[int, ...]:
+        """Cells along an axis, per level."""
+        steps = max(1, self.levels - 1)
+        growth = (self.finest / self.coarsest) ** (1 / steps)
+        return tuple(int(self.coarsest * growth**level + 1e-6) for level in range(self.levels))
+
+    @cached_property
+    def hashed(self) -> tuple[bool, ...]:
+        """Whether a level has fewer entries than corners."""
+        return tuple((cells + 1) ** self.dimensions > 1 << self.log2_entries for cells in self.resolutions)
+
+    @cached_property
+    def entries(self) -> tuple[int, ...]:
+        """Entries per level."""
+        return tuple(
+            1 << self.log2_entries if hashed else (cells + 1) ** self.dimensions
+            for cells, hashed in zip(self.resolutions, self.hashed)
+        )
+
+    @property
+    def table_shape(self) -> tuple[int, int]:
+        """Shape of the table: entries of all levels, features."""
+        return sum(self.entries), self.features
+
+    @property
+    def width(self) -> int:
+        """Features of a point."""
+        return self.levels * self.features
+
+
+def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
+    """Features ``[N, levels * features]`` of points ``[N, D]`` in the unit cube.
+
+    Points outside get the features of the nearest place on the border. Differentiable once, in table and points.
+
+    Args:
+        points: ``[N, D]`` in [0, 1].
+        table: ``grid.table_shape``.
+
+    Raises:
+        InputError: shapes do not fit the grid.
+    """
+    if points.ndim != 2 or points.shape[1] != grid.dimensions or tuple(table.shape) != grid.table_shape:
+        raise InputError("hash grid: shapes do not fit", expected=f"points [N, {grid.dimensions}], table {grid.table_shape}",
+                         got=f"{tuple(points.shape)}, {tuple(table.shape)}")  # fmt: skip
+    library = native.library()
+    fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (points, table))
+    if library is None or not fits or not len(points):
+        why = native.status() if library is None else f"{points.dtype} on {points.device}"
+        log.info_once(f"hash grids: plain torch ({why})")
+        return torch_encode(points, table, grid)
+    return _Encode.apply(points, table, grid, library)
+
+
+def torch_encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
+    """``encode`` in plain torch."""
+    inside, offset, made = points.clamp(0, 1), 0, []
+    for cells, hashed, entries in zip(grid.resolutions, grid.hashed, grid.entries):
+        at = inside * cells
+        first = at.detach().long().clamp(max=cells - 1)
+        part = at - first
+        total: Tensor | float = 0.0
+        for corner in range(1 << grid.dimensions):
+            number, weight, stride = torch.zeros_like(first[:, 0]), torch.ones_like(part[:, 0]), 1
+            for axis in range(grid.dimensions):
+                upper = corner >> axis & 1
+                step = first[:, axis] + upper
+                weight = weight * (part[:, axis] if upper else 1 - part[:, axis])
+                number = number ^ (step * _PRIMES[axis] & _MASK32) if hashed else number + step * stride
+                stride *= cells + 1
+            index = offset + (number & entries - 1 if hashed else number)
+            total = total + weight[:, None] * table[index]
+        made.append(total)
+        offset += entries
+    return torch.cat(made, 1)
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, table: Tensor, grid: HashGrid, library: ctypes.CDLL) -> Tensor:
+        places, values = points.detach().contiguous(), table.detach().contiguous()
+        out = torch.empty(len(places), grid.width)
+        _call(library, grid, (places, values), (out, None, None, None))
+        ctx.save_for_backward(places, values)
+        ctx.grid, ctx.library = grid, library
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        places, values = ctx.saved_tensors
+        of_points = torch.empty_like(places) if ctx.needs_input_grad[0] else None
+        of_table = torch.empty_like(values) if ctx.needs_input_grad[1] else None
+        _call(ctx.library, ctx.grid, (places, values), (None, upstream.contiguous(), of_table, of_points))
+        return of_points, of_table, None, None
+
+
+def _call(library: ctypes.CDLL, grid: HashGrid, given: tuple[Tensor, Tensor], rest: tuple[Tensor | None, ...]) -> None:
+    places, values = given
+    levels = grid.levels
+    sizes = (ctypes.c_int * 3)(grid.dimensions, levels, grid.features)
+    library.mudg_hash_grid.restype = ctypes.c_int
+    status = library.mudg_hash_grid(
+        _address(places), ctypes.c_int64(len(places)), _address(values), sizes, (ctypes.c_int32 * levels)(*grid.resolutions),
+        (ctypes.c_int64 * levels)(*grid.entries), (ctypes.c_uint8 * levels)(*grid.hashed), *map(_address, rest),
+    )  # fmt: skip
+    if status != 0:
+        raise InputError("the native library does not know such a hash grid", got=str(grid))
+
+
+def _address(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())

@@ -1,0 +1,323 @@
+"""Falling rain and snow: size distributions, drops and flakes as particles of world cells, and what they cover in an image.
+
+Every size falls with its own speed. Particles of one size stand still in a frame that falls with them; that frame is cut into cells,
+and a hash of the cell says how many particles it holds and where. So any camera at any time sees the same ones, without a simulation.
+
+Sources: Marshall and Palmer 1948 (drop sizes), Atlas et al. 1973 (fall speed), Gunn and Marshall 1958 (snow, melted diameters), Garg
+and Nayar 2007 (streaks: a drop covers a pixel for a share of the exposure and shows about 0.94 of the mean light of the upper
+hemisphere), Weber et al. 2015 (extinction of rain). Assumed: flakes have a tenth of the density of water, fall with 1.0 m/s and sway by
+0.1 m.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import seeds
+from mudg.base.types import View
+from mudg.base.weather_settings import FogSettings
+from mudg.core.weather.noise import hash_bits, unit
+
+# fog ------------------------------------------------------------------------------------------------------------------
+#
+# Fog and haze: Koschmieder's law in linear light, ``L = L0 t + A (1 - t)`` with transmittance t and airlight A.
+#
+# Extinction is 3.0 / visibility, as contrast falls to 5 % at the meteorological optical range. Distances are along the ray, not camera z.
+
+
+LEAST_SHARE = 0.05
+"""Haze is removed down to this transmittance: what is behind more of it cannot be recovered."""
+
+
+def extinction(visibility_m: float) -> float:
+    """Extinction per metre of a meteorological optical range in metres (5 % contrast: ln 20 = 3.0)."""
+    return 3.0 / visibility_m
+
+
+def optical_depth(range_m: Array, rise: Array, height_m: float, fog: FogSettings) -> Array:
+    """Optical depth f64[...] along rays.
+
+    Args:
+        range_m: distance along the ray, metres; infinite in the sky.
+        rise: sine of the ray's elevation.
+        height_m: of the camera above the ground.
+        fog: density and its height.
+    """
+    beta = extinction(fog.visibility_m)
+    if fog.height_m > 0:
+        h = fog.height_m
+        with np.errstate(invalid="ignore", over="ignore"):
+            x = np.clip(range_m * rise / h, -60, 60)
+            x = np.where(np.isnan(x), 0, x)
+            path = np.where(np.abs(x) < 1e-6, range_m, -np.expm1(-x) * h / np.where(np.abs(rise) < 1e-12, 1e-12, rise))
+        return beta * np.exp(-height_m / h) * path
+    # uniform below the top: the part of the ray that runs there
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = np.where(rise == 0, np.inf, (fog.top_m - height_m) / rise)
+        below = height_m < fog.top_m
+        inside = (
+            np.where(rise > 0, np.minimum(range_m, crossing), range_m)
+            if below
+            else np.where(rise < 0, np.maximum(range_m - crossing, 0), 0.0)
+        )
+    return beta * inside
+
+
+def transmittance(range_m: Array, rise: Array, height_m: float, fog: FogSettings) -> Array:
+    """Share of the light of a surface that reaches the camera, f64[...] in [0, 1]."""
+    return np.exp(-np.minimum(optical_depth(range_m, rise, height_m, fog), 700.0))
+
+
+def veiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDArray[np.float32]:
+    """Linear light f32[..., 3] behind air that lets the share [...] through and adds airlight f64[3] for the rest."""
+    t = share[..., None]
+    return (color * t + airlight * (1 - t)).astype(np.float32)
+
+
+def unveiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDArray[np.float32]:
+    """Inverse of ``veiled``, not below black; a share under ``LEAST_SHARE`` counts as that."""
+    t = np.maximum(share, LEAST_SHARE)[..., None]
+    return np.maximum((color - airlight * (1 - t)) / t, 0).astype(np.float32)
+
+
+# particles ------------------------------------------------------------------------------------------------------------
+
+
+Array = NDArray[np.float64]
+
+DROP_LIGHT = 0.94
+RAIN_EDGES_MM = (1.0, 1.5, 2.0, 3.0, 5.0)
+FLAKE_EDGES_MM = (0.7, 1.2, 2.0, 3.5)
+FLAKE_GROWTH = 10.0 ** (1 / 3)
+FLAKE_SPEED = 1.0
+FLAKE_SWAY_M = 0.1
+NEAREST_M = 0.25
+_STEP_PX = 0.7
+_MOST_STEPS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleSize:
+    """Particles of about one size.
+
+    Args:
+        density: per cubic metre.
+        diameter_m: whose square is the mean square.
+        fall_m_s: speed towards the ground.
+        sway_m: amplitude of a horizontal swing.
+    """
+
+    density: float
+    diameter_m: float
+    fall_m_s: float
+    sway_m: float = 0.0
+
+
+def _exponential(intercept: float, slope: float, edges_mm: tuple[float, ...]) -> list[tuple[float, float]]:
+    """Numbers per cubic metre and root mean square diameters in mm of an exponential distribution, per interval of diameters."""
+
+    def tails(d: float) -> tuple[float, float]:  # integrals of N and N D^2 from d to infinity
+        e = intercept * math.exp(-slope * d)
+        return e / slope, e * (d * d / slope + 2 * d / slope**2 + 2 / slope**3)
+
+    ends = [tails(d) for d in edges_mm]
+    found = [(a[0] - b[0], a[1] - b[1]) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [(number, math.sqrt(square / number)) for number, square in found if number > 0]
+
+
+def rain_sizes(mm_h: float) -> list[ParticleSize]:
+    """Drops of 1 to 5 mm at a rate in mm/h; smaller ones are part of the veil."""
+    if mm_h <= 0:
+        return []
+    rows = _exponential(8000.0, 4.1 * mm_h**-0.21, RAIN_EDGES_MM)
+    return [ParticleSize(n, d * 1e-3, 9.65 - 10.3 * math.exp(-0.6 * d)) for n, d in rows]
+
+
+def snow_sizes(mm_h: float) -> list[ParticleSize]:
+    """Flakes at a rate in mm/h of water, melted diameters of 0.7 to 3.5 mm."""
+    if mm_h <= 0:
+        return []
+    rows = _exponential(3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48, FLAKE_EDGES_MM)
+    return [ParticleSize(n, d * 1e-3 * FLAKE_GROWTH, FLAKE_SPEED, FLAKE_SWAY_M) for n, d in rows]
+
+
+def rain_extinction(mm_h: float) -> float:
+    """Extinction of rain per metre: 0.312 R^0.67 per km."""
+    return 0.312e-3 * mm_h**0.67 if mm_h > 0 else 0.0
+
+
+def snow_extinction(mm_h: float) -> float:
+    """Extinction of falling snow per metre: twice the area of all flakes in a cubic metre."""
+    if mm_h <= 0:
+        return 0.0
+    n0, slope = 3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48
+    return 2 * n0 * math.pi / 4 * FLAKE_GROWTH**2 * 2 / slope**3 * 1e-6
+
+
+def area_per_m(sizes: list[ParticleSize]) -> float:
+    """Area of the particles in a cubic metre, m^2 per m^3: what a ray meets per metre."""
+    return sum(s.density * math.pi / 4 * s.diameter_m**2 for s in sizes)
+
+
+def _velocity(size: ParticleSize, wind: tuple[float, float]) -> Array:
+    return np.array([wind[0], wind[1], -size.fall_m_s])
+
+
+def _inside(view: View, xyz: Array, reach_m: float, margin_m: float) -> NDArray[np.bool_]:
+    """Whether world places [N, 3] lie in the view's pyramid up to the reach, with a margin: bool[N]."""
+    camera = view.camera
+    local = (xyz - view.center_world) @ view.world_from_cam[:3, :3]
+    x, y, z = local.T
+    ok = (z > -margin_m) & (np.linalg.norm(local, axis=1) < reach_m + margin_m)
+    edges = ((-1, 0, camera.cx / camera.fx), (1, 0, (camera.width - camera.cx) / camera.fx),
+             (0, -1, camera.cy / camera.fy), (0, 1, (camera.height - camera.cy) / camera.fy))  # fmt: skip
+    for along_x, along_y, slope in edges:
+        ok &= (along_x * x + along_y * y - slope * z) / math.hypot(1, slope) < margin_m
+    return ok
+
+
+def _corners(view: View, reach_m: float) -> Array:
+    camera = view.camera
+    u = np.array([0, camera.width, 0, camera.width]) - camera.cx
+    v = np.array([0, 0, camera.height, camera.height]) - camera.cy
+    rays = np.stack([u / camera.fx, v / camera.fy, np.ones(4)], 1)
+    ends = np.concatenate([np.zeros((1, 3)), rays * reach_m, [[0, 0, reach_m]]])
+    return view.center_world + ends @ view.world_from_cam[:3, :3].T
+
+
+def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key: int) -> Array:
+    """World places f64[N, 3] at ``view.time_s`` of the particles that stand in the view's pyramid within the reach, and a few beside it.
+
+    Args:
+        size: how many there are in a cubic metre.
+        velocity: f64[3] m/s, the same for all.
+        view: camera, pose and time.
+        reach_m: distance from the camera.
+        key: of the random numbers.
+    """
+    time_s = view.time_s
+    cell = min(max((2.0 / size.density) ** (1 / 3), 0.25), 2.0)
+    margin = cell + size.sway_m
+    corners = _corners(view, reach_m) - velocity * time_s
+    low, high = np.floor((corners.min(0) - margin) / cell), np.floor((corners.max(0) + margin) / cell)
+    axes = [np.arange(int(a), int(b) + 1) for a, b in zip(low, high, strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    centers = (cells + 0.5) * cell + velocity * time_s
+    cells = cells[_inside(view, centers, reach_m, 0.87 * cell + size.sway_m)]
+    name = key & 0x7FFFFFFF
+    hashes = hash_bits(cells[:, 0], cells[:, 1], cells[:, 2], name)
+    mean = size.density * cell**3
+    most = int(mean + 7 * math.sqrt(mean) + 8)
+    k = np.arange(most)
+    chances = np.exp(-mean + k * math.log(mean) - np.array([math.lgamma(i + 1) for i in k]))
+    counts = np.searchsorted(np.cumsum(chances), unit(hashes), side="right")
+    owner = np.repeat(np.arange(len(cells)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    inside = np.stack([unit(hash_bits(hashes[owner], number, axis, name)) for axis in range(3)], 1)
+    found = (cells[owner] + inside) * cell + velocity * time_s
+    if size.sway_m:
+        phase = 2 * math.pi * unit(hash_bits(hashes[owner], number, 3, name))
+        pace = 2 + 3 * unit(hash_bits(hashes[owner], number, 4, name))
+        found[:, 0] += size.sway_m * np.sin(pace * time_s + phase)
+        found[:, 1] += size.sway_m * np.cos(pace * time_s + phase)
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moving:
+    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter, exposure time."""
+
+    xyz: Array
+    velocity: Array
+    diameter_m: float
+    shutter_s: float
+
+
+def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
+    """Optical depth f64[H, W] of particles before the surfaces.
+
+    A ball of w pixels that moves during the exposure covers, summed over pixels, pi/4 w^2 of one pixel on the axis, however long its
+    streak is; off the axis its image is longer, by range over depth. That sum is spread evenly over the streak; large balls have soft
+    edges.
+
+    Args:
+        view: camera and pose.
+        depth: camera z of the surfaces f[H, W], metres.
+        moving: the particles.
+    """
+    camera = view.camera
+    turn = view.world_from_cam[:3, :3]
+    middle = (moving.xyz - view.center_world) @ turn
+    half = (moving.velocity * moving.shutter_s / 2) @ turn
+    ends = [middle - half, middle + half]
+    kept = (ends[0][:, 2] > NEAREST_M) & (ends[1][:, 2] > NEAREST_M)
+    start, end = ends[0][kept], ends[1][kept]
+
+    def pixel(p: Array) -> Array:
+        return np.stack([camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy], 1)
+
+    a, b = pixel(start), pixel(end)
+    width = camera.fx * moving.diameter_m / middle[kept, 2]
+    lengths = np.linalg.norm(b - a, axis=1)
+    along = np.minimum(np.ceil(lengths / _STEP_PX).astype(np.int64) + 1, _MOST_STEPS)
+    across = np.ceil(width / _STEP_PX).astype(np.int64)
+    counts = along * across * across
+    owner = np.repeat(np.arange(len(a)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    n_across, n_along = across[owner], along[owner]
+    u = (number // (n_across * n_across) + 0.5) / n_along
+    rest = number % (n_across * n_across)
+    offset = np.stack([rest % n_across, rest // n_across], 1) + 0.5
+    at = a[owner] + u[:, None] * (b - a)[owner] + (offset / n_across[:, None] - 0.5) * width[owner][:, None]
+    z = start[owner, 2] + u * (end - start)[owner, 2]
+    stretch = np.linalg.norm(middle[kept], axis=1) / middle[kept, 2]
+    mass = (math.pi / 4 * width**2 * stretch / counts)[owner]
+    return _splat(at, mass, z, depth)
+
+
+def _splat(at: Array, mass: Array, z: Array, depth: NDArray[np.floating]) -> Array:
+    """Bilinear sums f64[H, W] of masses [N] at pixels [N, 2] that are nearer than the surfaces there."""
+    height, width = depth.shape
+    column, row = np.floor(at[:, 0]).astype(np.int64), np.floor(at[:, 1]).astype(np.int64)
+    inside = (column >= -1) & (column <= width) & (row >= -1) & (row <= height)
+    at, mass, z, column, row = at[inside], mass[inside], z[inside], column[inside], row[inside]
+    seen = z < depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    at, mass = at[seen] - 0.5, mass[seen]
+    c0, r0 = np.floor(at[:, 0]).astype(np.int64), np.floor(at[:, 1]).astype(np.int64)
+    fx, fy = at[:, 0] - c0, at[:, 1] - r0
+    total = np.zeros(height * width)
+    for dr, dc, weight in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
+        r, c = r0 + dr, c0 + dc
+        ok = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+        total += np.bincount((r * width + c)[ok], (mass * weight)[ok], minlength=height * width)
+    return total.reshape(height, width)
+
+
+@dataclass(frozen=True, slots=True)
+class Falling:
+    """What falls: sizes, wind along x and y in m/s, how near it is drawn, exposure time, and a name for the random numbers."""
+
+    sizes: list[ParticleSize]
+    wind_m_s: tuple[float, float]
+    reach_m: float
+    shutter_s: float
+    purpose: str
+
+
+def falling(
+    view: View, depth: NDArray[np.floating], fall: Falling, camera_velocity: tuple[float, float, float], seed: int
+) -> Array:
+    """Optical depth f64[H, W] of all particles of a kind within their reach, at ``view.time_s``."""
+    total = np.zeros(depth.shape)
+    for index, size in enumerate(fall.sizes):
+        velocity = _velocity(size, fall.wind_m_s)
+        xyz = places(size, velocity, view, fall.reach_m, seeds.key(seed, index, fall.purpose))
+        xyz = xyz[np.linalg.norm(xyz - view.center_world, axis=1) < fall.reach_m]
+        total += covered(
+            view, depth, Moving(xyz, velocity - np.asarray(camera_velocity), size.diameter_m, fall.shutter_s)
+        )
+    return total

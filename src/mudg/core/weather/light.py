@@ -1,0 +1,436 @@
+"""Another light on the same surfaces: overcast, dusk, night.
+
+A photograph holds reflected light only, so an albedo is estimated first: light divided by the irradiance of the recorded sun and sky. What
+that assumes: surfaces are matt; the recorded light is known (``Surroundings``); and where a shadow lies is known (``GBuffer.sunlit``) or
+can be guessed from brightness, which fails where dark and bright materials of one class mix. Glass, puddles and lamps of the recording keep
+their recorded look, scaled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mudg.base.palette import ID
+from mudg.base.types import View
+from mudg.base.weather_settings import LightSettings, ResponseSettings, SeasonSettings
+from mudg.core.weather.gbuffer import GBuffer, Surroundings, sky_share, world_points, world_rays
+from mudg.core.weather.ground import noise_seed, sky_light
+from mudg.core.weather.noise import patches, smoothstep
+
+# camera response: linear light to display values and back, as an explicit object that every caller chooses ------------
+
+
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Brightness of display values."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Brightness of linear light."""
+
+
+@dataclass(frozen=True, slots=True)
+class ToneCurve:
+    """A response and its inverse.
+
+    Args:
+        name: for messages.
+        encode: linear light f[..., 3] >= 0 to display values in [0, 1].
+        decode: display values to linear light. Values that the sensor clipped come back as the light at which it clips.
+    """
+
+    name: str
+    encode: Callable[[NDArray[np.floating]], Image]
+    decode: Callable[[NDArray[np.floating]], Image]
+
+
+def srgb_encode(light: NDArray[np.floating]) -> Image:
+    """Display values in [0, 1] of linear light, IEC 61966-2-1, clipped."""
+    x = np.clip(light, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def srgb_decode(display: NDArray[np.floating]) -> Image:
+    """Linear light of sRGB display values in [0, 1]."""
+    x = np.clip(display, 0, 1)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def gamma_curve(exponent: float = 2.2) -> ToneCurve:
+    """``display = light ** (1 / exponent)``."""
+    return ToneCurve(
+        f"gamma {exponent:g}",
+        lambda light: (np.clip(light, 0, 1) ** (1 / exponent)).astype(np.float32),
+        lambda display: (np.clip(display, 0, 1) ** exponent).astype(np.float32),
+    )
+
+
+SRGB = ToneCurve("srgb", srgb_encode, srgb_decode)
+LINEAR = ToneCurve(
+    "linear",
+    lambda light: np.clip(light, 0, 1).astype(np.float32),
+    lambda shown: np.clip(shown, 0, 1).astype(np.float32),
+)
+
+
+def curve_of(settings: ResponseSettings) -> ToneCurve:
+    """The curve that settings name."""
+    return {"srgb": SRGB, "linear": LINEAR, "gamma": gamma_curve(settings.gamma)}[settings.tone]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmicResponse:
+    """A camera with exposure, white balance, vignetting, a filmic shoulder, saturation and contrast (the generated city's camera).
+
+    Args:
+        exposure: factor on linear light.
+        white: factors of red, green and blue, f64[3].
+        saturation: colour about its own grey, 1 = unchanged.
+        contrast: slope of display values about 0.5.
+        vignette: share of the light lost in the corners.
+    """
+
+    exposure: float = 1.0
+    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    saturation: float = 1.0
+    contrast: float = 1.0
+    vignette: float = 0.0
+
+    def curve(self) -> ToneCurve:
+        """Response and inverse for images f[H, W, 3]. The inverse is exact where nothing was clipped."""
+        return ToneCurve("filmic", self._encode, self._decode)
+
+    def _gains(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        height, width = shape[:2]
+        y, x = np.mgrid[0:height, 0:width] + 0.5
+        r2 = ((2 * x - width) ** 2 + (2 * y - height) ** 2) / (width**2 + height**2)
+        return self.exposure * (1 - self.vignette * r2)[..., None] * np.array(self.white)
+
+    def _encode(self, light: NDArray[np.floating]) -> Image:
+        v = np.maximum(light * self._gains(light.shape), 0)
+        shown = np.clip(v * (2.51 * v + 0.03) / (v * (2.43 * v + 0.59) + 0.14), 0, 1)
+        luma = (shown @ LUMA)[..., None]
+        mixed = luma + (shown - luma) * self.saturation
+        encoded = srgb_encode(mixed).astype(np.float64)
+        return np.clip(0.5 + (encoded - 0.5) * self.contrast, 0, 1).astype(np.float32)
+
+    def _decode(self, display: NDArray[np.floating]) -> Image:
+        encoded = 0.5 + (np.asarray(display, np.float64) - 0.5) / self.contrast
+        mixed = srgb_decode(encoded).astype(np.float64)
+        luma = (mixed @ LUMA)[..., None]
+        y = np.clip(luma + (mixed - luma) / self.saturation, 0, 1)
+        # the root of y (2.43 v^2 + 0.59 v + 0.14) = 2.51 v^2 + 0.03 v that grows with y
+        a, b, c = 2.51 - 2.43 * y, 0.03 - 0.59 * y, -0.14 * y
+        v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
+        return (v / self._gains(display.shape)).astype(np.float32)
+
+
+# season ---------------------------------------------------------------------------------------------------------------
+#
+# Other seasons, as far as colours go: green leaves and grass take the colours of autumn or of winter.
+#
+# Luminance is kept but for one factor per season, so light, shadow and texture stay; only chromaticity changes, and only as far as a
+# surface of class vegetation or terrain is green: bark, flowers and soil stay. Which tree turns yellow and which brown follows from
+# value noise over the ground, so that all frames and cameras agree. Shapes stay: bare trees keep closed crowns, in the colour of twigs.
+
+
+LEAVES: Final = {"autumn": ((0.62, 0.36, 0.06), (0.55, 0.17, 0.04), (0.30, 0.16, 0.06)), "bare": ((0.21, 0.18, 0.15), (0.25, 0.22, 0.19))}
+"""Reflectances of what is left on trees, between which patches change."""
+GRASS: Final = {"autumn": (0.30, 0.27, 0.11), "bare": (0.29, 0.25, 0.16)}
+BRIGHTER: Final = {"autumn": 1.15, "bare": 0.8}
+"""Luminance against that of summer."""
+PATCH_M: Final = 3.0
+GREEN_FROM, GREEN_TO = 0.02, 0.12
+"""A surface is green by how far its green lies above the larger of red and blue, as a share of their sum."""
+
+
+def greenness(color: NDArray[np.floating]) -> Array:
+    """How green linear light [..., 3] is, f64 0 to 1."""
+    total = np.maximum(color.sum(-1), 1e-6)
+    return np.asarray(smoothstep(GREEN_FROM, GREEN_TO, (color[..., 1] - np.maximum(color[..., 0], color[..., 2])) / total), np.float64)
+
+
+def in_season(gbuffer: GBuffer, view: View, season: SeasonSettings, seed: int) -> GBuffer:
+    """The same surfaces in another season; what is no vegetation or terrain stays bit for bit.
+
+    Args:
+        gbuffer: as recorded in a leafy season; one without green stays.
+    """
+    plants = gbuffer.classes == ID["vegetation"]
+    grass = gbuffer.classes == ID["terrain"]
+    where = (plants | grass) & ~gbuffer.sky
+    if not where.any() or season.amount == 0:
+        return gbuffer
+    color = gbuffer.color[where].astype(np.float64)
+    places = world_points(view, gbuffer.depth)[where]
+    kinds = np.array(LEAVES[season.leaves], np.float64)
+    share = patches(places[:, 0], places[:, 1], PATCH_M, noise_seed(seed, "season")) * (len(kinds) - 1)
+    first = np.clip(share.astype(np.int64), 0, len(kinds) - 2)
+    leaf = kinds[first] + (share - first)[:, None] * (kinds[first + 1] - kinds[first])
+    target = np.where(grass[where][:, None], np.array(GRASS[season.leaves]), leaf)
+    target *= BRIGHTER[season.leaves] / (target @ LUMINANCE)[:, None]
+    weight = (season.amount * greenness(color))[:, None]
+    made = gbuffer.color.copy()
+    made[where] = (color * (1 - weight) + (color @ LUMINANCE)[:, None] * target * weight).astype(np.float32)
+    return replace(gbuffer, color=made)
+
+
+# relight --------------------------------------------------------------------------------------------------------------
+
+
+Array = NDArray[np.float64]
+Plane = NDArray[np.float32]
+Image = NDArray[np.float32]
+
+GROUND_ALBEDO = np.array([0.36, 0.34, 0.31])
+LEAST_ALBEDO, MOST_ALBEDO = 0.01, 0.9
+_CLASS_SPREAD = 0.35
+_TYPICAL_SPREAD = 0.5
+_PAINT_WEIGHT = 0.2  # vehicles and signs have any albedo: the image says little
+TYPICAL_ALBEDO = {
+    ID["road"]: 0.085,
+    ID["sidewalk"]: 0.23,
+    ID["building"]: 0.25,
+    ID["vegetation"]: 0.09,
+    ID["terrain"]: 0.12,
+}
+"""What decides whether all of a class is dark material in the sun or bright material in shadow."""
+
+# Night: irradiance 1 (times pi) stands for 50 lux.
+LAMP_COLOR = np.array([1.0, 0.82, 0.55])
+LAMP_POWER = 64.0
+"""50 lux at 8 m below the lamp."""
+LAMP_HALF_ANGLE_DEG = 75.0
+LAMP_HEAD_M = 0.5
+LAMP_RADIANCE = 2.5
+LAMP_REACH_M = 45.0
+BEAM_COLOR = np.array([1.0, 0.95, 0.85])
+BEAM_POWER = 400.0
+"""20,000 candela."""
+BEAM_CUT_DEG = -1.0
+BEAM_SIDE_M = 0.65
+BEAM_WIDTH_DEG = 14.0
+NIGHT_SKY = 0.012
+NIGHT_LEVEL = 0.55
+_LIT_IDS = (ID["traffic light"],)
+
+
+def irradiance(
+    normal: NDArray[np.floating], openness: NDArray[np.floating], sunlit: NDArray[np.floating], light: Surroundings
+) -> Array:
+    """Irradiance over pi f64[..., 3] of surfaces: sun where it reaches, sky by the normal, and light from the ground below."""
+    facing = np.maximum(normal @ light.sun_direction, 0) * sunlit
+    bounce = (0.30 * light.ambient + 0.22 * max(float(light.sun_direction[2]), 0.0) * light.sun) * GROUND_ALBEDO
+    up = (0.5 + 0.5 * normal[..., 2])[..., None]
+    sky = bounce + (light.ambient - bounce) * up
+    return facing[..., None] * light.sun + sky * sky_share(openness)[..., None]
+
+
+def refined_sunlit(gbuffer: GBuffer, light: Surroundings, given: Plane, trust: float = 2.0) -> Plane:
+    """Where the recorded sun reaches, f32[H, W], from a first guess and the image.
+
+    Each pixel is explained twice, lit and in shadow. The albedo of its class, halfway between typical and found, and the guess, blurred
+    by a pixel or two as shadows of a height map are, decide between the two. Surfaces that face away from the sun are in shadow.
+
+    Args:
+        gbuffer: the image.
+        light: recorded light.
+        given: first guess, 0 to 1.
+        trust: log odds that the blurred guess is right where it is certain.
+    """
+    ones, zeros = np.ones_like(given), np.zeros_like(given)
+    lit_level, shade_level = (irradiance(gbuffer.normal, gbuffer.openness, s, light).mean(-1) for s in (ones, zeros))
+    value = np.log(np.maximum(gbuffer.color.mean(-1), 1e-4))
+    as_lit, as_shade = value - np.log(np.maximum(lit_level, 1e-4)), value - np.log(np.maximum(shade_level, 1e-4))
+    prior = trust * (2 * ndimage.gaussian_filter(given, 1.5) - 1)
+    typical = np.log(np.array([TYPICAL_ALBEDO.get(n, np.nan) for n in range(256)]))[gbuffer.classes]
+    first = ((as_shade - typical) ** 2 - (as_lit - typical) ** 2) / (2 * _TYPICAL_SPREAD**2)
+    lit = 1 / (1 + np.exp(-np.clip(prior + np.nan_to_num(first), -30, 30)))
+    for _ in range(3):
+        odds = prior.copy()
+        for number in np.unique(gbuffer.classes[~gbuffer.sky]):
+            of_class = (gbuffer.classes == number) & ~gbuffer.sky
+            albedo = np.where(lit > 0.5, as_lit, as_shade)[of_class]
+            middle = np.median(albedo)
+            if number in TYPICAL_ALBEDO:
+                middle = (middle + np.log(TYPICAL_ALBEDO[number])) / 2
+            spread = max(1.4826 * float(np.median(np.abs(albedo - middle))), _CLASS_SPREAD)
+            weight = 1.0 if number in TYPICAL_ALBEDO else _PAINT_WEIGHT
+            evidence = (as_shade[of_class] - middle) ** 2 - (as_lit[of_class] - middle) ** 2
+            odds[of_class] += weight * evidence / (2 * spread**2)
+        lit = 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
+    facing = gbuffer.normal @ light.sun_direction > 0.02
+    return np.where(facing & ~gbuffer.sky, lit, 0).astype(np.float32)
+
+
+def sunlit_of(gbuffer: GBuffer, light: Surroundings) -> Plane:
+    """The given plane, refined by the image; without one, brightness alone decides."""
+    if float(light.sun.max()) < 1e-3:
+        return np.zeros(gbuffer.depth.shape, np.float32)
+    if gbuffer.sunlit is None:
+        return refined_sunlit(gbuffer, light, np.full(gbuffer.depth.shape, 0.5, np.float32), 0.0)
+    return refined_sunlit(gbuffer, light, gbuffer.sunlit)
+
+
+def albedo_of(gbuffer: GBuffer, light: Surroundings, sunlit: Plane) -> Array:
+    """Albedo f64[H, W, 3]: light over irradiance, between ``LEAST_ALBEDO`` and ``MOST_ALBEDO``; 0 in the sky.
+
+    An albedo of more than four times the median of its class, or less than a quarter, is taken halfway back to that limit (in
+    logarithms): there the estimate of light is wrong more often than the surface is special.
+    """
+    raw = gbuffer.color / np.maximum(irradiance(gbuffer.normal, gbuffer.openness, sunlit, light), 1e-4)
+    albedo = np.clip(raw, LEAST_ALBEDO, MOST_ALBEDO)
+    for number in np.unique(gbuffer.classes[~gbuffer.sky]):
+        of_class = (gbuffer.classes == number) & ~gbuffer.sky
+        logs = np.log(albedo[of_class])
+        middle = np.median(logs, axis=0)
+        limited = np.clip(logs, middle - np.log(4), middle + np.log(4))
+        albedo[of_class] = np.exp((logs + limited) / 2)
+    albedo[gbuffer.sky] = 0
+    return albedo
+
+
+def ground_level(light: Surroundings) -> float:
+    """Irradiance over pi of level ground, half of it in the sun: what automatic exposure follows."""
+    return float((light.ambient + 0.5 * light.sun * max(float(light.sun_direction[2]), 0.0)).mean())
+
+
+def target_light(recorded: Surroundings, settings: LightSettings) -> Surroundings:
+    """The light that settings name, in the unit of the recorded one, as a camera with automatic exposure shows it: ground as bright
+    as recorded under an overcast sky, half as bright at dusk; at night a lamp's 50 lux stand for ``NIGHT_LEVEL`` of the recorded light."""
+    level = ground_level(recorded)
+    azimuth, elevation = np.radians(settings.sun_azimuth_deg), np.radians(settings.sun_elevation_deg)
+    low_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    zero, upright = np.zeros(3), np.array([0.0, 0.0, 1.0])
+
+    def light(scale: float, sky: tuple[Array, Array, Array], sun: Array, direction: Array) -> Surroundings:
+        horizon, zenith, ambient = (scale * part for part in sky)
+        return replace(recorded, horizon=horizon, zenith=zenith, ambient=ambient, sun=scale * sun, sun_direction=direction,
+                       airlight=0.9 * horizon)  # fmt: skip
+
+    if settings.time == "overcast":
+        grey = np.array([0.97, 1.0, 1.04])
+        return light(level, (1.05 * grey, 0.9 * grey, grey), zero, upright)
+    if settings.time == "dusk":
+        sun = np.array([2.6, 1.45, 0.68]) * 0.8 * float(smoothstep(-2.0, 6.0, settings.sun_elevation_deg))
+        sky = np.array([1.05, 0.68, 0.45]), np.array([0.2, 0.27, 0.5]), np.array([0.4, 0.42, 0.56])
+        plain = light(1.0, sky, sun, low_sun)
+        return light(0.5 * level / ground_level(plain), sky, sun, low_sun)
+    if settings.time == "night":
+        dark = NIGHT_SKY * np.array([0.8, 0.85, 1.0])
+        return light(NIGHT_LEVEL * level, (2.5 * dark * np.array([1.3, 1.0, 0.7]), 0.6 * dark, dark), zero, upright)
+    return recorded
+
+
+def lamp_light(xyz: Array, normal: NDArray[np.floating], lamps: Array) -> Array:
+    """Irradiance over pi f64[N, 3] of street lamps at world places [M, 3] that shine down in a cone; nothing casts shadows."""
+    total = np.zeros(len(xyz))
+    edge = np.cos(np.radians(LAMP_HALF_ANGLE_DEG))
+    for lamp in lamps:
+        rows = np.flatnonzero(np.linalg.norm(xyz - lamp, axis=1) < LAMP_REACH_M)
+        to = lamp - xyz[rows]
+        d = np.maximum(np.linalg.norm(to, axis=1), 0.5)
+        down, facing = to[:, 2] / d, np.maximum((normal[rows] * to).sum(1) / d, 0)
+        total[rows] += LAMP_POWER * facing * smoothstep(edge, edge + 0.25, down) / d**2
+    return total[:, None] * LAMP_COLOR
+
+
+def headlight(xyz: Array, normal: NDArray[np.floating], vehicle: Array) -> Array:
+    """Irradiance over pi f64[N, 3] of two dipped headlights.
+
+    Args:
+        xyz: world places f64[N, 3].
+        normal: f[N, 3].
+        vehicle: world_from_lights f64[4, 4]: x forward, z up, origin between the two lights.
+    """
+    total = np.zeros(len(xyz))
+    for side in (-1, 1):
+        lamp = vehicle[:3, 3] + side * BEAM_SIDE_M * vehicle[:3, 1]
+        to = xyz - lamp
+        d = np.maximum(np.linalg.norm(to, axis=1), 0.5)
+        x, y, z = (to @ vehicle[:3, :3]).T
+        across, up = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z / d, -1, 1)))
+        beam = np.exp(-((across / BEAM_WIDTH_DEG) ** 2)) * (
+            1 - 0.98 * smoothstep(BEAM_CUT_DEG - 0.5, BEAM_CUT_DEG + 0.5, up)
+        )
+        beam *= np.exp(-((np.minimum(up - BEAM_CUT_DEG, 0) / 9.0) ** 2)) * (x > 0)
+        facing = np.maximum(-(normal * to).sum(1) / d, 0)
+        total += BEAM_POWER * beam * facing / d**2
+    return total[:, None] * BEAM_COLOR
+
+
+def vehicle_lights(view: View, ground_z_m: float) -> Array:
+    """Where the headlights are when only a forward camera is known: below it, 0.65 m above the road, along its axis."""
+    forward = view.world_from_cam[:3, 2] * np.array([1.0, 1.0, 0.0])
+    x = forward / max(float(np.linalg.norm(forward)), 1e-6)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross([0.0, 0.0, 1.0], x), [0.0, 0.0, 1.0]], 1)
+    pose[:3, 3] = (*(view.center_world + 1.0 * x)[:2], ground_z_m + 0.65)
+    return pose
+
+
+def relit(
+    gbuffer: GBuffer, view: View, recorded: Surroundings, target: Surroundings, point_lights: Array | None = None
+) -> tuple[Image, Plane]:
+    """The image under another light, and confidence f32[H, W].
+
+    Args:
+        gbuffer: the image under the recorded light; ``new_sunlit`` says where the new sun reaches.
+        view: its camera and pose.
+        recorded: light of the recording.
+        target: light to change to.
+        point_lights: irradiance over pi f64[H, W, 3] of lamps, added to the target's.
+
+    Returns:
+        Linear light f32[H, W, 3]; the sky is the target's gradient. Confidence is low where the recorded light was little of what the
+        new one needs (deep shadow made bright) and in the sky.
+    """
+    sunlit = sunlit_of(gbuffer, recorded)
+    new_sunlit = gbuffer.new_sunlit if gbuffer.new_sunlit is not None else np.ones_like(sunlit)
+    old = irradiance(gbuffer.normal, gbuffer.openness, sunlit, recorded)
+    new = irradiance(gbuffer.normal, gbuffer.openness, new_sunlit, target)
+    if point_lights is not None:
+        new = new + point_lights
+    light = albedo_of(gbuffer, recorded, sunlit) * new
+    kept = np.isin(gbuffer.classes, _LIT_IDS)[..., None] & (gbuffer.color > 0.5)
+    light = np.where(kept, gbuffer.color, light)
+    rays, length = world_rays(view)
+    sky = gbuffer.sky
+    light[sky] = sky_light(target, (rays[..., 2] / length)[sky])
+    gain = (new / np.maximum(old, 1e-4)).mean(-1)
+    certain = np.clip(2 / np.maximum(gain, 2), 0.2, 1) * (1 - 2 * np.minimum(sunlit, 1 - sunlit))
+    return light.astype(np.float32), np.where(sky, 0.3, np.clip(certain, 0.1, 1)).astype(np.float32)
+
+
+def night_lights(gbuffer: GBuffer, view: View, target: Surroundings, settings: LightSettings) -> Array:
+    """Irradiance over pi f64[H, W, 3] of street lamps and the recording vehicle's headlights."""
+    out = np.zeros(gbuffer.color.shape)
+    solid = ~gbuffer.sky
+    xyz, normal = world_points(view, gbuffer.depth)[solid], gbuffer.normal[solid]
+    if settings.lamps and target.lamps is not None:
+        out[solid] += lamp_light(xyz, normal, np.asarray(target.lamps, np.float64))
+    if settings.headlights:
+        out[solid] += headlight(xyz, normal, vehicle_lights(view, target.ground_z_m))
+    # single normals at kerbs are wrong now and then, and a headlight shows every one
+    calm = ndimage.median_filter(out, (3, 3, 1))
+    return np.where(gbuffer.ground[..., None], calm, out)
+
+
+def lamp_heads(gbuffer: GBuffer, view: View, lamps: Array) -> NDArray[np.bool_]:
+    """bool[H, W]: what stands within ``LAMP_HEAD_M`` of a street lamp's place, and so shines."""
+    heads = np.zeros(gbuffer.depth.shape, bool)
+    solid = ~gbuffer.sky
+    xyz = world_points(view, gbuffer.depth)[solid]
+    for lamp in np.asarray(lamps, np.float64):
+        heads[solid] |= np.linalg.norm(xyz - lamp, axis=1) < LAMP_HEAD_M
+    return heads & (gbuffer.classes == ID["pole"])
+
+
+def glow(color: Image, share: float = 0.06, sigma_px: float = 4.0) -> Image:
+    """Light f32[H, W, 3] with a soft halo about what is brighter than the sensor's white."""
+    excess = np.maximum(color - 1, 0)
+    spread = sum(ndimage.gaussian_filter(excess, (s, s, 0)) for s in (sigma_px, 3 * sigma_px))
+    return (color + share * spread).astype(np.float32)

@@ -1,1 +1,0 @@
-"""Floor 3: bytes to types and back. Knows no model."""

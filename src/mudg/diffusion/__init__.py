@@ -1,0 +1,1 @@
+"""The multi-modal diffusion model: condition, network, training, adaptation, sampling."""

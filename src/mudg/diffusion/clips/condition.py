@@ -1,0 +1,701 @@
+"""Conditions and training clips for the diffusion model.
+
+`build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
+
+1. the cloud is projected into every view (z-buffer);
+2. far points that shine through gaps between near ones are removed (`core.visible`, rule `condition`);
+3. pixels without a measured depth get the nearest measured one; the mask of what was measured is kept;
+4. every pixel is carried by its depth into recorded images taken at about the same time, and takes their colour if it
+   falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
+5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
+6. the classes of labelled points and images travel with their colours;
+7. renders of a scene fitted to the recorded images, if there is one, are given too, and in steps 3 to 5 tell the depth of what no
+   point was measured on.
+
+Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
+only, zero where nothing is known, the reference image in frame 0 being put in by the model.
+
+Training clips are made of these in `from_city.py` and `from_log.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base import geometry, palette, scratch
+from mudg.base.errors import InputError
+from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDepth, Track, View
+from mudg.core.pictures import resize_area, to_bytes
+from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
+from mudg.diffusion.clips.stacked import KeptImages, stacked
+
+if TYPE_CHECKING:
+    from mudg.base.types import RenderPlanes
+
+
+# vacated --------------------------------------------------------------------------------------------------------------
+#
+# Conditions of an edited drive where something stood that is not there any more.
+#
+# No photograph taken then shows what is behind it. Other photographs may, taken earlier or later from elsewhere: they are warped in as
+# everywhere. What is left is a hole: its colours continue those around it, and nothing in it counts as seen.
+
+
+GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
+DYNAMIC = torch.tensor(sorted(palette.DYNAMIC_IDS), dtype=torch.uint8)
+KNOWN_SHARE = 0.5
+"""A render shows what is there where its certainty is at least this share of the usual one of its view."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vacated:
+    """Where edits changed a view.
+
+    Args:
+        mask: pixels bool[H,W] in which something stood that is gone, its shadow included.
+        ground: depth f32[H,W] in metres of level ground there, NaN above it.
+        shown: pixels bool[H,W] in which objects are new or stand anew.
+        stood: pixels bool[H,W] of the mask in which it stood itself.
+    """
+
+    mask: Tensor
+    ground: Tensor
+    shown: Tensor
+    stood: Tensor
+
+    def known(self, render: RenderPlanes | None) -> Tensor:
+        """Pixels bool[H,W] behind what is gone that other photographs determined: the fit knows what is there. Not in its shadow, which
+        a fit knows just as well."""
+        return torch.zeros_like(self.stood) if render is None else self.stood & determined(render, ~self.mask)
+
+
+def determined(render: RenderPlanes, usual: Tensor) -> Tensor:
+    """Pixels bool[H,W] that photographs determined about as well as the `usual` ones bool[H,W] of the view, by the median. A longer fit is
+    more certain everywhere, so only the share counts."""
+    covered = (render.alpha[0] > 0.5) & usual
+    if not bool(covered.any()):
+        return torch.zeros_like(covered)
+    return (render.alpha[0] > 0.5) & (render.certainty[0] >= KNOWN_SHARE * render.certainty[0][covered].median())
+
+
+VacatedAt = Callable[[View], Vacated]
+
+
+def ground_behind(depth: Tensor, measured: Tensor, vacated: Vacated) -> Tensor:
+    """Depth f32[H,W] in which vacated pixels without a `measured` bool[H,W] surface lie on the ground, where there is some."""
+    there = vacated.mask & ~measured & torch.isfinite(vacated.ground)
+    return torch.where(there, vacated.ground, depth)
+
+
+def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tuple[Tensor, Tensor]:
+    """Colours f32[3,H,W] and classes u8[H,W] with those of a `hole` bool[H,W] continued smoothly from around it: ground from ground, what
+    is above it from what stands there or from the sky, nothing from objects that move."""
+    ground, moving = torch.isin(ids, GROUND_IDS), torch.isin(ids, DYNAMIC)
+    low = torch.isfinite(vacated.ground)
+    for part, given in ((hole & low, ground), (hole & ~low, ~ground & ~moving)):
+        source = given & ~hole
+        if bool(part.any()) and bool(source.any()):
+            filled = _pulled(color[None] * source, source.float()[None, None])[0]
+            color, ids = torch.where(part, filled, color), torch.where(part, _nearest(ids, source), ids)
+    return color, ids
+
+
+def _pulled(color: Tensor, weight: Tensor) -> Tensor:
+    """Colours where weight is 1, continued where it is 0; `color` [1,C,H,W] is 0 there."""
+    if min(color.shape[-2:]) <= 2:
+        return color.sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp(min=1e-6) + torch.zeros_like(color)
+    pool = lambda x: functional.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)  # noqa: E731
+    share = pool(weight)
+    coarse = pool(color) / share.clamp(min=1e-6)
+    coarse = _pulled(coarse * (share > 0), (share > 0).float())
+    larger = functional.interpolate(coarse, size=color.shape[-2:], mode="bilinear", align_corners=False)
+    return color + (1 - weight) * larger
+
+
+def _nearest(ids: Tensor, source: Tensor) -> Tensor:
+    """Class u8[H,W] of the nearest pixel of `source` bool[H,W], for every pixel."""
+    rows, columns = ndimage.distance_transform_edt(~source.numpy(), return_distances=False, return_indices=True)
+    return ids[torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))]
+
+
+def uncertain_there(render: RenderPlanes, vacated: Vacated, hole: Tensor, color: Tensor) -> RenderPlanes:
+    """A render that claims to know nothing where something stood, but for what other photographs determined, and shows in the hole what the
+    condition does."""
+    unknown = vacated.mask & ~vacated.known(render)
+    certainty = torch.where(unknown, torch.zeros_like(render.certainty), render.certainty)
+    return replace(render, color=torch.where(hole, color, render.color), certainty=certainty)
+
+
+# condition ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionRules:
+    """How a condition is made. Sizes are those of the model's images, distances metres, times seconds."""
+
+    width: int
+    height: int
+    fine_width: int = 0
+    fine_height: int = 0
+    """Colours are gathered on this finer grid and averaged (0 = at the condition's own size): that avoids aliasing."""
+    near_m: float = 1.0
+    far_m: float = 100.0
+    point_px: float = 1.0
+    """Side of the square a point covers, in pixels."""
+    same_time_s: float = 0.06
+    """Recorded images nearer in time than this may also colour dynamic objects."""
+    images_per_view: int = 6
+    """How many recorded images are tried per view, nearest in time (then in place) first."""
+    other_camera_s: float = 0.1
+    """Images of other cameras count as farther away in time by this."""
+    least_overlap: float = 0.02
+    """Images that show less than this share of a view are not tried."""
+    hidden_share: float = 0.08
+    """A pixel is hidden in a recorded image if a surface there is nearer by this share of its depth plus 0.3 m."""
+    warp: bool = True
+    """Warp recorded images in; otherwise holes keep the nearest point's colour."""
+    backdrop_m: float = 80.0
+    """Distance at which the nearest recorded image is put up as a backdrop."""
+    occluder_m: float = 0.2
+    """Side of the square with which points hide what lies behind them."""
+    measured_reach_px: int = 4
+    """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is one."""
+    sure_alpha: float = 0.9
+    """A pixel near to a measured one takes the depth of the render all the same where the render covers it by more than this ..."""
+    another_surface: float = 0.1
+    """... and is farther from the measured depth than this share of it: the outlines of surfaces are the render's."""
+    solid_alpha: float = 0.5
+    """Coverage from which on a render has a surface; what it covers less is taken to be far away above the horizon."""
+    ground_slope: float = 0.05
+    """Rays that fall at least this much per metre ahead end on a surface, covered by the render or not."""
+    published: bool = False
+    """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
+
+    With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour by
+    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes beside it
+    (`Condition.measured`).
+    """
+
+    def project(self, cloud: FusedCloud, tracks: Sequence[Track], view: View) -> ProjectedPoints:
+        """The cloud's points in a view of the condition's resolution."""
+        drawn = ProjectConfig(
+            static_splat_px=self.point_px, object_splat_px=self.point_px, near_m=self.near_m, far_m=self.far_m,
+            occluder_m=0.0 if self.published else self.occluder_m,
+        )  # fmt: skip
+        return project_sparse(cloud, tracks, view, drawn, hide=not self.published)
+
+
+OVERLAP_GRID = 24, 16
+"""Columns and rows of the places of a view by which it is told how much of it another image shows."""
+GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
+MOVING_IDS = torch.tensor(palette.DYNAMIC_IDS, dtype=torch.uint8)
+BOX_MARGIN_M = 0.2
+"""Rendered surfaces this far outside an object's box still count as the object."""
+LEAST_FALL = 0.02
+"""Metres per metre of depth by which a ray must fall to be followed to the ground."""
+RenderAt = Callable[[View], RenderPlanes]
+"""What a fitted scene shows at a view, without the leading dimension."""
+
+
+class Recolor(Protocol):
+    """Another weather or light for what the published system is given."""
+
+    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of the valid pixels of projected points."""
+        ...
+
+    def photo(self, view: View, rgb: Tensor) -> Tensor:
+        """A recorded image f32[3,H,W]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnCloud:
+    """A fused cloud ready to be drawn, and the renders of a fitted scene, if there is one."""
+
+    cloud: FusedCloud
+    tracks: Sequence[Track]
+    rules: ConditionRules
+    render_at: RenderAt | None
+    vacated_at: VacatedAt | None = None
+    """Where something stood that an edit took away."""
+
+    def look(self, view: View, far_ids: Tensor) -> Surfaces:
+        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured pixel.
+
+        What the render does not cover is taken for sky, unless it lies below the horizon or `far_ids` u8[H,W], the classes of what
+        a recorded image shows in the same direction (255 = unknown), are something else: there a surface stands that no image
+        shows, and the nearest measured pixel stands for it, in the render too.
+        """
+        sparse = self.rules.project(self.cloud, self.tracks, view)
+        nearest = _nearest_measured(sparse)
+        color, depth, moving, ids = _filled(sparse, nearest, self.rules)
+        vacated = None if self.vacated_at is None else self.vacated_at(view)
+        if self.render_at is None:
+            depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
+            return Surfaces(sparse.valid, color, depth, moving, ids, None, vacated)
+        render = self.render_at(view)
+        near = torch.from_numpy(ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1)))
+        solid = render.alpha[0] >= self.rules.solid_alpha
+        near &= _among_measured(sparse, depth, self.rules) | ~_another_surface(depth, render, self.rules)
+        surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
+        hidden = ~solid & (below_horizon(view, self.rules.ground_slope) | surface_seen) & bool(sparse.valid.any())
+        depth = torch.where(sparse.valid, depth, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m))
+        render = replace(render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics))
+        shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
+        pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
+        depth = pick(depth, shown)
+        depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
+        moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
+        return Surfaces(sparse.valid, pick(color, render.color), depth, moving, pick(ids, render.semantics[0]), render, vacated)
+
+    def _in_objects(self, view: View, depth: Tensor, asked: Tensor) -> Tensor:
+        """Which of the `asked` pixels bool[H,W], at `depth` f32[H,W], lie in the box of an object that has a cloud of its own."""
+        found = torch.zeros_like(asked)
+        rows, columns = torch.nonzero(asked, as_tuple=True)
+        if not len(rows):
+            return found
+        rays = torch.stack([axis[rows, columns] for axis in ray_directions(view)], 1).double()
+        places = (rays * depth[rows, columns, None]).numpy() + view.center_world
+        inside_one = np.zeros(len(places), np.bool_)
+        for track in self.tracks:
+            pose = track.pose_at(view.time_s) if track.id in self.cloud.objects else None
+            if pose is not None:
+                own = (places - pose[:3, 3]) @ pose[:3, :3]
+                inside_one |= (np.abs(own) <= 0.5 * track.size_m + BOX_MARGIN_M).all(1)
+        found[rows, columns] = torch.from_numpy(inside_one)
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfaces:
+    """What is known of a view before images are warped in: measured bool[H,W]; color f32[3,H,W], depth f32[H,W] m, moving bool[H,W]
+    and ids u8[H,W] of every pixel; the render, if there is one; and where something stood that an edit took away."""
+
+    measured: Tensor
+    color: Tensor
+    depth: Tensor
+    moving: Tensor
+    ids: Tensor
+    render: RenderPlanes | None
+    vacated: Vacated | None = None
+
+    def with_hole(self, color: Tensor, ids: Tensor, found: Tensor) -> tuple[Surfaces, Tensor, Tensor, Tensor]:
+        """These surfaces, colours, classes and `found` bool[H,W] of a view after images were warped in to these pixels: what was vacated
+        and not found continues what is around it, and does not count as measured; where objects are new the render is all that there is,
+        and counts like a photograph, as it does where it knows what something hid."""
+        if self.vacated is None:
+            return self, color, ids, found
+        if self.render is not None:
+            shown = (self.vacated.shown & (self.render.alpha[0] > 0.5)) | (self.vacated.known(self.render) & ~found)
+            color, ids = torch.where(shown, self.render.color, color), torch.where(shown, self.render.semantics[0], ids)
+            found = found | shown
+        ground = self.measured & torch.isin(self.ids, GROUND_IDS) & torch.isfinite(self.vacated.ground)
+        hole = self.vacated.mask & ~found  # what stood there, or its shadow, may have coloured points: of ground, only their place counts
+        color, ids = continued(color, ids, self.vacated, hole)
+        render = None if self.render is None else uncertain_there(self.render, self.vacated, hole, color)
+        return replace(self, measured=self.measured & ~(hole & ~ground), render=render), color, ids, found
+
+
+def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the nearest valid pixel for every pixel; the pixel itself where nothing at all is valid."""
+    if not valid.any():
+        rows, columns = np.indices(valid.shape)
+        return rows, columns
+    nearest: Any = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    return nearest[0], nearest[1]
+
+
+def filled_depth(measured: SparseDepth, far_m: float = 100.0) -> Tensor:
+    """Depth f32[T,1,H,W] with the nearest measured pixel's where nothing was measured; `far_m` in a frame without any."""
+    filled = []
+    for image, valid in zip(measured.depth[:, 0].numpy(), measured.valid[:, 0].numpy(), strict=True):
+        filled.append(torch.from_numpy(image[nearest_valid(valid)] if valid.any() else np.full_like(image, far_m)))
+    return torch.stack(filled)[:, None]
+
+
+def carry(view: View, depth: Tensor, other: View) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the pixels of `view`, at `depth` f32[K,H,W] metres, lie in another view.
+
+    Returns x, y f32[K,H,W] in pixels of the other view and z f32[K,H,W] metres (not positive = behind it).
+    """
+    camera, target = view.camera, other.camera
+    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
+    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
+    m = torch.from_numpy((other.cam_from_world @ view.world_from_cam).astype(np.float32))
+    turned = [m[i, 0] * u[None, :] + m[i, 1] * v[:, None] + m[i, 2] for i in range(3)]
+    px, py, pz = (turned[i] * depth + m[i, 3] for i in range(3))
+    safe = pz.clamp(min=0.1)
+    return *geometry.pinhole(target.intrinsics, px, py, safe), pz
+
+
+def ray_directions(view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """World x, y and z, f32[H,W] each, of the pixels' rays, of length 1 along the camera's z."""
+    camera = view.camera
+    columns, rows = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (camera.width, camera.height))
+    u, v = geometry.pinhole_ray(camera.intrinsics, columns, rows)
+    turn = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32))
+    x, y, z = (turn[i, 0] * u[None, :] + turn[i, 1] * v[:, None] + turn[i, 2] for i in range(3))
+    return x, y, z
+
+
+def below_horizon(view: View, slope: float) -> Tensor:
+    """Which pixels' rays fall by more than `slope` metres per horizontal metre, bool[H,W]."""
+    x, y, z = ray_directions(view)
+    return z < -slope * torch.hypot(x, y)
+
+
+def look_up(image: Tensor, x: Tensor, y: Tensor, mode: str = "bilinear") -> Tensor:
+    """Values of `image` f32[C,h,w] at pixel coordinates f32[K,H,W] -> f32[K,C,H,W]; the border is repeated outside."""
+    grid = torch.stack([x * (2.0 / image.shape[-1]) - 1, y * (2.0 / image.shape[-2]) - 1], -1)
+    rows = grid.flatten(0, 1)[None]
+    found = functional.grid_sample(image[None], rows, mode=mode, padding_mode="border", align_corners=False)
+    return found[0].unflatten(1, grid.shape[:2]).movedim(0, 1)
+
+
+def look_up_ids(ids: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Ids of `ids` u8[h,w] in the pixels at coordinates f32[K,H,W] -> u8[K,H,W]; the border is repeated outside."""
+    column = x.floor().clamp(0, ids.shape[1] - 1).long()
+    return ids[y.floor().clamp(0, ids.shape[0] - 1).long(), column]
+
+
+def inside(view: View, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Which of the carried pixels lie in front of and inside the other view, bool of their shape."""
+    return (z > 0.1) & (x >= 0.5) & (x <= view.camera.width - 0.5) & (y >= 0.5) & (y <= view.camera.height - 0.5)
+
+
+def warp(
+    view: View, depth: Tensor, source: WarpSource, surface: Tensor, hidden_share: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
+
+    `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image.
+    Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image, usable and not hidden in it.
+    """
+    x, y, z = carry(view, depth[None], source.view)
+    in_front = look_up(surface[None], x, y, "nearest")[0, 0]
+    found = inside(source.view, x, y, z)[0] & (in_front >= z[0] * (1 - hidden_share) - 0.3)
+    if source.usable is not None:
+        found &= look_up_ids(source.usable, x, y)[0]
+    return look_up(source.rgb, x, y)[0], look_up_ids(source.semantics, x, y)[0], found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WarpSource:
+    """A recorded image made ready for warping: rgb f32[3,h,w] in common colours (of 0..1 or a little beyond), depth f32[h,w] m (filled),
+    moving bool[h,w],
+    semantics u8[h,w] (255 = unknown), usable bool[h,w] or None (all)."""
+
+    view: View
+    rgb: Tensor
+    depth: Tensor
+    moving: Tensor
+    semantics: Tensor
+    usable: Tensor | None = None
+
+
+def build_conditions(
+    cloud: FusedCloud,
+    tracks: Sequence[Track],
+    views: Sequence[View],
+    recorded: Sequence[Photo],
+    rules: ConditionRules,
+    sources: dict[int, WarpSource] | None = None,
+    render_at: RenderAt | None = None,
+    vacated_at: VacatedAt | None = None,
+    *,
+    recolor: Recolor | None = None,
+) -> tuple[Condition, Condition]:
+    """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
+
+    Args:
+        cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
+        recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
+        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views. Of
+            `KeptImages` with a folder, fine conditions of large views lie in files.
+        render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
+            (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
+        vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
+        recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
+
+    Returns:
+        Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
+        where a point was seen and kept, `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as
+        reference the recorded image of the first view's camera that is nearest in time (black if there is none).
+
+    Raises:
+        InputError: no views.
+    """
+    if not views:
+        raise InputError("a condition needs at least one view", where="clips.build_conditions")
+    small = [view.resized(rules.width, rules.height) for view in views]
+    reference = _reference(small[0], recorded, rules, recolor)
+    if rules.published:
+        condition = _published_condition(cloud, tracks, small, reference, rules, recolor)
+        return condition, condition
+    sources = {} if sources is None else sources
+    size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
+    fine_views = tuple(view.resized(*size) for view in views)
+    points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
+    folder = sources.folder if isinstance(sources, KeptImages) else None
+    made = (_condition_of_view(points, view, recorded, rules, sources) for view in fine_views)
+    rows = ((*part, *(() if render_at is None else _planes(shown))) for part, shown in made)
+    color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
+    renders = RenderPlanes(*planes) if planes else None
+    fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
+                     warped, backdrop, ids, far_ids, renders)  # fmt: skip
+    if size == (rules.width, rules.height):
+        return fine, fine
+
+    def reduced(x: Tensor) -> Tensor:
+        return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
+
+    small_size = (rules.height, rules.width)
+    picked = lambda x: functional.interpolate(x, size=small_size, mode="nearest-exact")  # noqa: E731
+    small_renders = None
+    if renders is not None:
+        small_renders = RenderPlanes(
+            reduced(renders.color), picked(renders.depth), reduced(renders.alpha), reduced(renders.certainty), picked(renders.semantics)
+        )
+    small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders), vacated_at)
+    own = [small_points.look(view, there[0]) for view, there in zip(small, picked(far_ids))]
+    own = [o.with_hole(o.color, o.ids, there[0] > 0.5)[0] for o, there in zip(own, reduced(warped))]
+    scratch.rest_mapped()
+    own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
+    condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
+                          reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip
+    return condition, fine
+
+
+def _planes(render: RenderPlanes | None) -> tuple[Tensor, ...]:
+    return tuple(getattr(render, f.name) for f in fields(RenderPlanes))
+
+
+def _in_order(renders: RenderPlanes | None) -> RenderAt | None:
+    """Renders [T,..] that are at hand, handed out one view after another."""
+    if renders is None:
+        return None
+    numbers = iter(range(len(renders.color)))
+
+    def next_one(view: View) -> RenderPlanes:
+        del view
+        number = next(numbers)
+        return renders.map(lambda x: x[number])
+
+    return next_one
+
+
+def _condition_of_view(
+    points: DrawnCloud, view: View, recorded: Sequence[Photo], rules: ConditionRules, sources: dict[int, WarpSource]
+) -> tuple[tuple[Tensor, ...], RenderPlanes | None]:
+    """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
+    the backdrop u8[1,H,W] of one view, at its size; and its render."""
+
+    def source(number: int) -> WarpSource:
+        if number not in sources:
+            sources[number] = _prepare_source(points, recorded[number], view, rules)
+        return sources[number]
+
+    shape = (view.camera.height, view.camera.width)
+    if not (rules.warp and recorded):
+        here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
+        found = torch.zeros_like(here.measured)
+        here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
+        ids = own_ids[None]
+        return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
+    nearest = source(min(range(len(recorded)), key=_rank_of_images(view, recorded, rules)))
+    x, y, _ = carry(view, torch.full((1, *shape), rules.backdrop_m), nearest.view)
+    backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
+    known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
+    far_ids = far_ids if known is None else torch.where(known, far_ids, palette.UNLABELLED)
+    here = points.look(view, far_ids[0])
+    color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
+    shown = points.cloud.colors
+    backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
+    for number in _order_of_images(view, depth, recorded, rules):
+        image = source(number)
+        fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
+        surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
+        rgb, labels, new = warp(view, depth, image, surface, rules.hidden_share)
+        rgb = shown.image_of(view.camera.name, rgb).clamp(0, 1) if shown.to_common else rgb
+        new = new & ~found if fresh else new & ~found & ~here.moving
+        color = torch.where(new, rgb, color)
+        ids = torch.where(new & (labels != palette.UNLABELLED), labels, ids)
+        found = found | new
+    here, color, ids, found = here.with_hole(color, ids, found)
+    if known is not None:  # what stood there is not part of the picture any more
+        backdrop, far_ids = torch.where(known, backdrop, color), torch.where(known, far_ids, ids[None])
+    return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
+
+
+def _nearest_measured(sparse: ProjectedPoints) -> tuple[Tensor, Tensor]:
+    """Row and column of the nearest measured pixel, i64[H,W] each, for every pixel."""
+    rows, columns = nearest_valid(sparse.valid.numpy())
+    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))
+
+
+def _filled(
+    sparse: ProjectedPoints, nearest: tuple[Tensor, Tensor], rules: ConditionRules
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest measured pixel, for every pixel."""
+    if not bool(sparse.valid.any()):
+        return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
+    here = (..., *nearest)
+    return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
+
+
+def _another_surface(depth: Tensor, render: RenderPlanes, rules: ConditionRules) -> Tensor:
+    """Where a render shows another surface than the one at `depth` f32[H,W], and photographs determined it, bool[H,W]."""
+    sure = (render.alpha[0] > rules.sure_alpha) & determined(render, torch.ones_like(depth, dtype=torch.bool))
+    return sure & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
+
+
+def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRules) -> Tensor:
+    """Which pixels are measured, or have measured ones of their filled depth f32[H,W] to both sides in some direction, at most twice
+    `measured_reach_px` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
+    reach = 2 * rules.measured_reach_px
+    own = functional.pad(torch.where(sparse.valid, sparse.depth, torch.inf)[None, None], (reach,) * 4, value=torch.inf)[0, 0]
+    height, width = depth.shape
+
+    def on_side(down: int, right: int) -> Tensor:
+        found = torch.zeros_like(sparse.valid)
+        for step in range(1, reach + 1):
+            top, left = reach + step * down, reach + step * right
+            there = own[top : top + height, left : left + width]
+            found |= (there - depth).abs() <= rules.another_surface * depth
+        return found
+
+    between = sparse.valid.clone()
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        between |= on_side(down, right) & on_side(-down, -right)
+    return between
+
+
+def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Tensor]) -> Tensor:
+    """Filled depth f32[H,W] in which ground goes on at the height, not at the depth, of the nearest measured pixel; `ids` u8[H,W] are
+    that pixel's classes."""
+    falls = -ray_directions(view)[2]
+    there = falls[nearest]
+    level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (there > LEAST_FALL)
+    return torch.where(level, depth * there / falls.clamp(min=LEAST_FALL), depth)
+
+
+def _published_condition(
+    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules,
+    recolor: Recolor | None,
+) -> Condition:  # fmt: skip
+    own = (rules.width, rules.height)
+    native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
+    seen = views if native == own else [view.resized(*native) for view in views]
+    sparse = [rules.project(cloud, tracks, view) for view in seen]
+    valid = torch.stack([s.valid for s in sparse])[:, None]
+    colors = [s.rgb if recolor is None else recolor.points(view, s) for view, s in zip(seen, sparse, strict=True)]
+    color = torch.stack(colors) * valid
+    depth = torch.stack([s.depth for s in sparse])[:, None] * valid
+    if native != own:
+        color = functional.interpolate(color, size=own[::-1], mode="nearest")
+        depth = functional.interpolate(depth, size=own[::-1], mode="bilinear", align_corners=False)
+        valid = (color > 0).any(1, keepdim=True) | (depth > 0)
+    return Condition(tuple(views), color, depth, valid, reference, measured=_measured(cloud, tracks, views, rules))
+
+
+def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], rules: ConditionRules) -> SparseDepth:
+    """What visible points measure at views of the condition's size.
+
+    Points are drawn on a grid at least as fine as the camera's and the condition's, without those that others hide, and each pixel
+    takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is not preferred.
+    """
+    own, seen = (rules.width, rules.height), replace(rules, published=False)
+    grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
+    points = [seen.project(cloud, tracks, view if grid == own else view.resized(*grid)) for view in views]
+    whole = SparseDepth(*(torch.stack([getattr(p, name) for p in points])[:, None] for name in ("depth", "valid")))
+    return whole.map(lambda x: functional.interpolate(x.float(), size=own[::-1], mode="nearest-exact").to(x.dtype))
+
+
+def _reference(view: View, recorded: Sequence[Photo], rules: ConditionRules, recolor: Recolor | None) -> Tensor:
+    own = [r for r in recorded if r.view.camera.name == view.camera.name] or list(recorded)
+    if not own:
+        return torch.zeros(3, rules.height, rules.width)
+    nearest = min(own, key=lambda r: abs(r.view.time_s - view.time_s))
+    rgb = nearest.rgb
+    if nearest.usable is not None and not nearest.usable.all():
+        rgb = rgb[nearest_valid(nearest.usable)]
+    if recolor is not None:
+        rgb = to_bytes(recolor.photo(nearest.view, image_tensor(rgb)))
+    if rules.published and rules.fine_width:
+        size = (rules.height, rules.width)
+        return functional.interpolate(image_tensor(rgb)[None], size=size, mode="bilinear", align_corners=False)[0]
+    return image_tensor(resize_area(rgb, rules.width, rules.height))
+
+
+def image_tensor(rgb: NDArray[np.uint8]) -> Tensor:
+    """Image u8[H,W,3] as f32[3,H,W] in [0,1]."""
+    return torch.from_numpy(rgb.copy()).permute(2, 0, 1).float().div(255.0).contiguous()
+
+
+def _rank_of_images(
+    view: View, recorded: Sequence[Photo], rules: ConditionRules
+) -> Callable[[int], tuple[float, bool, float]]:
+    """What sorts recorded images by how well they serve a view (see `_order_of_images`)."""
+
+    def rank(number: int) -> tuple[float, bool, float]:
+        other = recorded[number].view
+        distance_m = float(np.linalg.norm(other.center_world - view.center_world))
+        elsewhere = other.camera.name != view.camera.name
+        return round((abs(other.time_s - view.time_s) + rules.other_camera_s * elsewhere) / 0.02), elsewhere, distance_m
+
+    return rank
+
+
+def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
+    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the same camera
+    before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
+
+    columns, rows = min(view.camera.width, OVERLAP_GRID[0]), min(view.camera.height, OVERLAP_GRID[1])
+    coarse = view.resized(columns, rows)
+    there = functional.interpolate(depth[None, None], size=(rows, columns), mode="nearest-exact")[0]
+    chosen: list[int] = []
+    for number in sorted(range(len(recorded)), key=_rank_of_images(view, recorded, rules)):
+        if len(chosen) == rules.images_per_view:
+            break
+        other = recorded[number].view
+        if not chosen or float(inside(other, *carry(coarse, there, other)).float().mean()) >= rules.least_overlap:
+            chosen.append(number)
+    return chosen
+
+
+def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: ConditionRules) -> WarpSource:
+    """A recorded image brought to about as many pixels as the target view, with its depth."""
+    camera = recorded.view.camera
+    scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
+    width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
+    view = recorded.view.resized(width, height)
+    ids = _ids_at(recorded, width, height)
+    here = points.look(view, ids)
+    rgb = image_tensor(resize_area(recorded.rgb, width, height))
+    common = points.cloud.colors.image_to_common(camera.name, rgb)
+    usable = None if recorded.usable is None else _coarser(recorded.usable, width, height)
+    return WarpSource(view, common, here.depth, here.moving, ids, usable)
+
+
+def _coarser(usable: NDArray[np.bool_], width: int, height: int) -> Tensor:
+    """Which pixels bool[height,width] of an image brought to this size show nothing but usable ones."""
+    spoilt = torch.from_numpy(~usable).float()[None, None]
+    return functional.adaptive_max_pool2d(spoilt, (height, width))[0, 0] == 0
+
+
+def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
+    """The image's classes u8[height,width], each from the pixel in its middle; 255 without labels."""
+    if recorded.semantics is None:
+        return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)
+    own = torch.from_numpy(recorded.semantics.astype(np.uint8))
+    return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]

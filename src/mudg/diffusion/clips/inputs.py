@@ -1,0 +1,249 @@
+"""Conditions of which parts are switched off, for measuring what each part brings.
+
+The small diffusion model was trained on whole conditions (at times without classes or renders). A condition without points or without
+recorded images is therefore outside of what it has seen: such a measurement says what the trained model makes of the rest, not what
+a model trained without that part would make.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mudg.base import palette
+from mudg.base.camera_colors import SAME_COLORS, CameraColors
+from mudg.base.errors import UsageError
+from mudg.base.types import Condition, FusedCloud, Photo, Track, View
+from mudg.base.weather_settings import Conditions
+from mudg.core import weather
+from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
+from mudg.core.project import ProjectedPoints
+from mudg.core.weather import DriveFacts, ShownView
+from mudg.diffusion.clips.condition import ConditionRules, RenderAt, VacatedAt, WarpSource, build_conditions
+
+# near points ----------------------------------------------------------------------------------------------------------
+#
+# The condition of FreeVS: coloured LiDAR points of a few frames around each view, and nothing else.
+#
+# Points of the sweeps within two frames of a view's time; those of moving objects are gathered in their boxes and put where the boxes are
+# at the view's time. One pixel per point, the nearest wins, black elsewhere. No depth, no recorded image, no classes, no renders. Unlike
+# FreeVS we do not reserve a margin around objects, and do not crop rows that LiDAR never covers.
+#
+# Its training simulates another view on the recorded path: half of the clips there are made of points that are four frames off.
+
+
+NEAR_FRAMES: Final = 2
+"""Points of so many frames before and after a view are shown."""
+OTHER_FRAMES: Final = 4
+"""How many frames off the points of a simulated view are."""
+OTHER_SHARE: Final = 0.5
+_RULES: Final = FusionRules(min_object_points=1)
+
+
+@dataclass(frozen=True, slots=True)
+class NearSweeps:
+    """The sweeps of a log, fused a few at a time.
+
+    Args:
+        times_s: of the sweeps. read: a sweep by its number. tracks: all boxes. period_s: time from frame to frame.
+        colors: how the cameras of the log show common colours.
+    """
+
+    times_s: tuple[float, ...]
+    read: Callable[[int], SweepShots]
+    tracks: Sequence[Track]
+    period_s: float
+    colors: CameraColors = SAME_COLORS
+    clouds: dict[tuple[int, ...], FusedCloud] = field(default_factory=dict)
+    """Clouds that were made already, by the numbers of their sweeps."""
+
+    def numbers_at(self, time_s: float) -> tuple[int, ...]:
+        """The sweeps within two frames of the one nearest to a time."""
+        if not self.times_s:
+            return ()
+        nearest = min(self.times_s, key=lambda t: abs(t - time_s))
+        reach = (NEAR_FRAMES + 0.5) * self.period_s
+        return tuple(n for n, t in enumerate(self.times_s) if abs(t - nearest) <= reach)
+
+    def cloud_at(self, time_s: float) -> FusedCloud:
+        """Their points: static ones in the world, others in their boxes."""
+        numbers = self.numbers_at(time_s)
+        if numbers not in self.clouds:
+            self.clouds[numbers] = fuse_sweeps(map(self.read, numbers), self.tracks, _RULES, self.colors)[0]
+        return self.clouds[numbers]
+
+
+def near_condition(sweeps: NearSweeps, views: Sequence[View], rules: ConditionRules, late_s: float = 0.0) -> Condition:
+    """The model's condition for ``views``, resized to the rules' size.
+
+    Args:
+        rules: size and distance limits; nothing else counts. late_s: how much later than its view the points of a view were measured.
+    """
+    small = tuple(view.resized(rules.width, rules.height) for view in views)
+    bare = replace(rules, published=True, point_px=1.0)
+    seen = [bare.project(sweeps.cloud_at(view.time_s + late_s), sweeps.tracks, view) for view in small]
+    valid = torch.stack([s.valid for s in seen])[:, None]
+    shown = [sweeps.colors.image_of(v.camera.name, s.rgb).clamp(0, 1) if sweeps.colors.to_common else s.rgb for v, s in zip(small, seen)]
+    color = torch.stack(shown) * valid
+    unknown = torch.full_like(valid, palette.UNLABELLED, dtype=torch.uint8)
+    depth = torch.full(valid.shape, float(rules.far_m))
+    return Condition(small, color, depth, valid, torch.zeros_like(color[0]), torch.zeros_like(valid), color, unknown, unknown)
+
+
+def simulated_lateness_s(sweeps: NearSweeps, rng: np.random.Generator) -> float:
+    """How late the points of a training clip on the recorded path are: half of them four frames, to either side."""
+    return 0.0 if rng.random() >= OTHER_SHARE else float(rng.choice([-1.0, 1.0])) * OTHER_FRAMES * sweeps.period_s
+
+
+# weathered ------------------------------------------------------------------------------------------------------------
+#
+# Views in other weather or light, and what the published system is given of them: points and a reference image, edited before they are
+# brought to the network's size. Geometry and classes stay.
+
+
+SKY: Final = palette.ID["sky"]
+
+
+@dataclass(frozen=True, eq=False)
+class InWeather:
+    """Weather for the views of a drive: settings, light and ground of the drive, seed of drops and patches, and the velocity of the
+    cameras at a time."""
+
+    settings: Conditions
+    drive: DriveFacts
+    seed: int
+    velocity_at: Callable[[float], tuple[float, float, float]]
+
+    def image(self, view: View, rgb: Tensor, depth: Tensor, ids: Tensor) -> Tensor:
+        """Colours f32[3,H,W] in this weather, from depth f32[1,H,W] and classes u8[1,H,W]; sky has no depth."""
+        metres = torch.where(ids == SKY, torch.zeros_like(depth), depth)[0].numpy().astype(np.float32)
+        shown = ShownView(view, rgb.permute(1, 2, 0).numpy(), metres, ids[0].numpy())
+        made, _ = weather.edited_view(shown, self.settings, self.seed, self.drive, self.velocity_at(view.time_s))
+        return torch.from_numpy(np.ascontiguousarray(made.transpose(2, 0, 1), np.float32)).clamp(0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class WeatheredPoints:
+    """Points and recorded images of a drive in weather, with the surfaces of a fitted scene between the points and behind the images."""
+
+    how: InWeather
+    render_at: RenderAt
+
+    def points(self, view: View, seen: ProjectedPoints) -> Tensor:
+        """Colours f32[3,H,W] of projected points in this weather, each at its own distance; meaningless where there are none."""
+        shown = self.render_at(view)
+        ids = torch.where(seen.valid & (shown.semantics == SKY), palette.UNLABELLED, shown.semantics)
+        depth = torch.where(seen.valid, seen.depth, shown.depth)
+        return self.how.image(view, torch.where(seen.valid, seen.rgb, shown.color), depth, ids.to(torch.uint8))
+
+    def photo(self, view: View, rgb: Tensor) -> Tensor:
+        """A recorded image f32[3,H,W] in this weather."""
+        shown = self.render_at(view)
+        return self.how.image(view, rgb, shown.depth, shown.semantics)
+
+
+# ablated --------------------------------------------------------------------------------------------------------------
+
+
+ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
+"""full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
+without recorded images and renders. concat: points and that image, without anything warped by depth, and without renders. repair:
+renders of a fit and that image, without anything measured. Of published-type models reference and points leave out the other; concat
+shows the image in frame 0, beside the points, and not in the image tokens."""
+
+
+COVERED = 0.5
+"""Opacity above which a render covers a pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionSources:
+    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the log's
+    sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and,
+    for published-type models, its weather."""
+
+    cloud: FusedCloud
+    tracks: Sequence[Track]
+    recorded: Sequence[Photo]
+    rules: ConditionRules
+    render_at: RenderAt | None = None
+    near: NearSweeps | None = None
+    vacated_at: VacatedAt | None = None
+    weather: InWeather | None = None
+
+
+def conditions_of(
+    sources: ConditionSources, parts: ConditionParts, views: Sequence[View], kept: dict[int, WarpSource]
+) -> tuple[Condition, Condition]:
+    """The model's condition for ``views`` with only some of its parts, and the same on the fine grid.
+
+    Args:
+        kept: recorded images that are prepared already (see ``build_conditions``).
+    """
+    rules = sources.rules
+    cloud, tracks, recorded = sources.cloud, sources.tracks, sources.recorded
+    if parts == "freevs":
+        if sources.near is None:
+            raise UsageError("this condition needs the sweeps of the log", got=parts)
+        condition = near_condition(sources.near, views, rules)
+        return condition, condition
+    if parts == "full":
+        how, render_at = sources.weather, sources.render_at
+        recolor = WeatheredPoints(how, render_at) if rules.published and how is not None and render_at is not None else None
+        return build_conditions(cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor)
+    if parts == "repair":
+        return _of_renders(sources, views, kept)
+    if rules.published:
+        whole = build_conditions(cloud, tracks, views, recorded, rules, kept)[0]
+        if parts == "reference":
+            whole = replace(whole, valid=torch.zeros_like(whole.valid), measured=None)
+        else:
+            whole = replace(whole, reference_in="frame" if parts == "concat" else "nowhere")
+        return whole, whole
+    points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)
+    if parts == "points":
+        return points
+    images = build_conditions(cloud, tracks, views, recorded, replace(rules, images_per_view=1), kept)
+    small, fine = (_with_backdrop(a, b, rules, parts) for a, b in zip(points, images, strict=True))
+    return small, fine
+
+
+def _of_renders(
+    sources: ConditionSources, views: Sequence[View], kept: dict[int, WarpSource]
+) -> tuple[Condition, Condition]:
+    """Renders in the place of points, none of them measured, and the nearest recorded image. Where a render covers a pixel it counts as a
+    recorded image that was warped there: it is the picture that is repaired."""
+    if sources.render_at is None:
+        raise UsageError("this condition needs renders of a fitted scene", got="repair")
+    rules, static = replace(sources.rules, images_per_view=1), sources.cloud.static
+    labels = None if static.semantics is None else static.semantics[:0]
+    empty = FusedCloud(replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors)
+    made = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
+
+    def bare(given: Condition) -> Condition:
+        shown = given.renders
+        if shown is None:
+            raise UsageError("this condition needs renders of a fitted scene", got="repair")
+        return replace(
+            given, color=shown.color, depth=shown.depth, semantics=shown.semantics, valid=torch.zeros_like(given.valid),
+            warped=shown.alpha > COVERED,
+        )  # fmt: skip
+
+    small, fine = (bare(given) for given in made)
+    return small, fine
+
+
+def _with_backdrop(points: Condition, images: Condition, rules: ConditionRules, parts: ConditionParts) -> Condition:
+    """The points with the backdrop of the images, or that backdrop alone."""
+    given = replace(points, backdrop=images.backdrop, backdrop_semantics=images.backdrop_semantics)
+    if parts == "concat" or images.backdrop is None:
+        return given
+    return replace(
+        given, color=images.backdrop, semantics=images.backdrop_semantics, valid=torch.zeros_like(points.valid),
+        depth=torch.full_like(points.depth, rules.far_m),
+    )  # fmt: skip

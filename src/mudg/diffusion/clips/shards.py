@@ -1,0 +1,393 @@
+"""Training clips on disk: one file per generated city, read back clip by clip.
+
+A shard is a safetensors file with, for K clips of T frames,
+
+    rgb u8[K,T,3,H,W]  depth f16[K,T,H,W] metres (codes beyond 1000 m and sky as 1000)  semantics u8[K,T,H,W]
+    color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]  flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped, 4 = depth
+        is not true, it only fills a gap; clips of recorded logs)
+    backdrop u8[K,T,3,H,W]  reference u8[K,3,H,W]  shift_m f32[K]
+    ids, backdrop_ids u8[K,T,H,W]: classes that came with color and backdrop, 255 = unknown
+    world_from_cam f64[K,T,4,4]  intrinsics f64[K,T,4] (fx, fy, cx, cy)
+    point_color u8[K,T,3,H,W], cities for scoring only: colour of the nearest point, no image warped in
+
+and, where a fitted scene was rendered,
+
+    render u8[K,T,3,H,W]  render_depth f16[K,T,H,W]  alpha, certainty u8[K,T,H,W] (of 255)  render_ids u8[K,T,H,W]
+    rendered bool[K]: false = this clip has no renders
+
+and, of recorded logs with annotated depth, depth_confidence u8[K,T,H,W] (of 255)
+
+and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0 = nothing
+
+and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column, scale).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from mudg.base import seeds, store
+from mudg.base.errors import InputError
+from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, SparseDepth, View
+
+Result = TypeVar("Result")
+FAR_M = 1000.0
+FINE = "fine_"
+"""What the names of a patch's arrays begin with."""
+FLAG_VALID, FLAG_WARPED, FLAG_DEPTH_UNKNOWN = 1, 2, 4
+
+
+def shard_path(folder: Path, city: int) -> Path:
+    """Where the clips of one city lie."""
+    return folder / f"city_{city:07d}.safetensors"
+
+
+def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArray[np.generic]]:
+    """Arrays of a shard from clips of one size.
+
+    Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is, and
+    marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
+    """
+
+    def u8(image: Tensor) -> NDArray[np.uint8]:
+        return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+    def f16(depth: Tensor, known: Tensor | None = None) -> NDArray[np.float16]:
+        far = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.full_like(depth, FAR_M))
+        far = far if known is None or gaps else torch.where(known, far, torch.full_like(far, FAR_M))
+        return far.clamp(max=FAR_M)[:, 0].numpy().astype(np.float16)
+
+    def flags(clip: Clip) -> NDArray[np.uint8]:
+        c = clip.condition
+        warped = torch.zeros_like(c.valid) if c.warped is None else c.warped
+        unknown = ~clip.depth_valid if gaps else torch.zeros_like(c.valid)
+        marks = c.valid * FLAG_VALID + warped * FLAG_WARPED + unknown * FLAG_DEPTH_UNKNOWN
+        return marks[:, 0].to(torch.uint8).numpy()
+
+    def ids(c: Condition, known: Tensor | None) -> NDArray[np.uint8]:
+        return (torch.full_like(c.valid, 255, dtype=torch.uint8) if known is None else known)[:, 0].numpy()
+
+    def intrinsics(c: Condition) -> NDArray[np.float64]:
+        return np.array([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in c.views], np.float64)
+
+    conditions = [clip.condition for clip in clips]
+    arrays = {
+        "rgb": np.stack([u8(c.rgb) for c in clips]),
+        "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
+        "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
+        "color": np.stack([u8(c.color) for c in conditions]),
+        "sparse_depth": np.stack([f16(c.depth) * (c.depth[:, 0] != 0).numpy() for c in conditions]),
+        "flags": np.stack([flags(c) for c in clips]),
+        "backdrop": np.stack([u8(c.color if c.backdrop is None else c.backdrop) for c in conditions]),
+        "reference": np.stack([u8(c.reference) for c in conditions]),
+        "ids": np.stack([ids(c, c.semantics) for c in conditions]),
+        "backdrop_ids": np.stack([ids(c, c.backdrop_semantics) for c in conditions]),
+        "world_from_cam": np.stack([np.stack([v.world_from_cam for v in c.views]) for c in conditions]),
+        "intrinsics": np.stack([intrinsics(c) for c in conditions]),
+        "shift_m": np.asarray([c.shift_m for c in clips], np.float32),
+    }
+    points = [u8(c.point_color) for c in clips if c.point_color is not None]
+    if points:
+        arrays["point_color"] = np.stack(points)
+    if any(c.renders is not None for c in conditions):
+        shown = [_empty_renders(c) if c.renders is None else c.renders for c in conditions]
+        arrays |= {
+            "render": np.stack([u8(r.color) for r in shown]), "render_depth": np.stack([f16(r.depth) for r in shown]),
+            "alpha": np.stack([u8(r.alpha)[:, 0] for r in shown]), "certainty": np.stack([u8(r.certainty)[:, 0] for r in shown]),
+            "render_ids": np.stack([r.semantics[:, 0].numpy() for r in shown]),
+            "rendered": np.array([c.renders is not None for c in conditions]),
+        }  # fmt: skip
+    measured = [c.measured for c in conditions if c.measured is not None]
+    if measured and len(measured) == len(clips):
+        arrays["measured"] = np.stack([f16(m.depth) * m.valid[:, 0].numpy() for m in measured])
+    if any(c.depth_confidence is not None for c in clips):
+        arrays["depth_confidence"] = np.stack([u8(c.depth_weight)[:, 0] for c in clips])
+    patches = [clip.fine for clip in clips if clip.fine is not None]
+    if patches and len(patches) == len(clips):
+        fine = pack_clips([patch.clip for patch in patches], gaps=gaps)
+        arrays |= {f"{FINE}{name}": values for name, values in fine.items()}
+        arrays[f"{FINE}place"] = np.array([[p.row, p.column, p.scale] for p in patches], np.int32)
+    return arrays
+
+
+def _empty_renders(condition: Condition) -> RenderPlanes:
+    nothing = torch.zeros_like(condition.depth)
+    return RenderPlanes(
+        condition.color, nothing, nothing, nothing, torch.full_like(condition.valid, 255, dtype=torch.uint8)
+    )
+
+
+def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write one city's clips, completely or not at all."""
+    store.write_safetensors(shard_path(folder, city), dict(arrays))
+
+
+class ShardSource(Protocol):
+    """Shards that are brought to this machine when they are needed, by number."""
+
+    def clips_in(self, number: int) -> int:
+        """Number of clips in a shard."""
+        ...
+
+    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
+        """What `read` makes of a shard's file."""
+        ...
+
+
+def clips_in(folder: Path | ShardSource, city: int) -> int:
+    """Number of clips in a shard."""
+    return clips_at(shard_path(folder, city)) if isinstance(folder, Path) else folder.clips_in(city)
+
+
+def clips_at(path: Path) -> int:
+    """Number of clips in the shard at `path`; InputError if its arrays are not those of a shard."""
+    with _open(path) as shard:
+        _check_arrays(shard, path)
+        return int(shard.get_slice("shift_m").get_shape()[0])
+
+
+def frames_in(folder: Path | ShardSource, city: int) -> int:
+    """Frames of each clip in a shard."""
+    return _frames_at(shard_path(folder, city)) if isinstance(folder, Path) else folder.reading(city, _frames_at)
+
+
+def _frames_at(path: Path) -> int:
+    with _open(path) as shard:
+        return int(shard.get_slice("rgb").get_shape()[1])
+
+
+def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
+    try:
+        return safe_open(str(store.regular(path)), "numpy")
+    except (SafetensorError, OSError) as error:
+        raise InputError("a shard of training clips is missing or damaged", where=str(path), got=str(error),
+            remedy="delete it; it is made again") from error  # fmt: skip
+
+
+_PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "backdrop", "ids", "backdrop_ids", "world_from_cam",
+              "intrinsics")  # fmt: skip
+
+
+_RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
+_ARRAYS = {
+    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")), "reference": ("U8", "K3HW"),
+    **dict.fromkeys(("depth", "sparse_depth", "measured", "render_depth"), ("F16", "KTHW")),
+    **dict.fromkeys(
+        ("semantics", "flags", "ids", "backdrop_ids", "alpha", "certainty", "render_ids", "depth_confidence"), ("U8", "KTHW")
+    ),
+    "world_from_cam": ("F64", "KT44"), "intrinsics": ("F64", "KT4"), "shift_m": ("F32", "K"), "rendered": ("BOOL", "K"),
+    "place": ("I32", "K3"),
+}  # fmt: skip
+"""Types and axes of a shard's arrays: clips, frames, rows, columns, and sizes that are always the same."""
+
+
+def _check_arrays(shard: Any, path: Path) -> None:
+    """InputError where an array is missing, or of another type or size than the others say; only the header is read."""
+    names = set(shard.keys())
+    for prefix in ("", FINE) if f"{FINE}place" in names else ("",):
+        required = {prefix + name for name in (*_PER_FRAME, "reference", "shift_m", *(_RENDERS if f"{prefix}rendered" in names else ()))}
+        if required - names:
+            raise _damaged(path, "every array of a shard", f"no {', '.join(sorted(required - names))}")
+        shape = shard.get_slice(f"{prefix}rgb").get_shape()
+        sizes = {"3": 3, "4": 4, **dict(zip("KT3HW", shape, strict=False))}
+        for name, (kind, axes) in _ARRAYS.items():
+            if prefix + name in names:
+                part = shard.get_slice(prefix + name)
+                wanted = [sizes.get(axis, 0) for axis in axes]
+                if part.get_dtype() != kind or part.get_shape() != wanted or 0 in wanted or sizes["3"] != 3:
+                    got = f"{prefix}{name}: {part.get_dtype()} {part.get_shape()}"
+                    raise _damaged(path, f"{kind} {wanted}", got)
+
+
+def _check_values(found: Mapping[str, Tensor], path: Path) -> None:
+    """InputError for numbers that are not finite, and for classes that do not exist."""
+    for name, value in found.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            raise _damaged(path, "finite numbers", name)
+        if name in ("semantics", "ids", "backdrop_ids", "render_ids") and bool(((value >= len(CLASSES)) & (value != UNLABELLED)).any()):
+            raise _damaged(path, f"classes below {len(CLASSES)}, or {UNLABELLED}", f"{name}: {int(value[value != UNLABELLED].max())}")
+
+
+def _damaged(path: Path, expected: str, got: str) -> InputError:
+    return InputError("a shard of training clips is damaged", where=str(path), expected=expected, got=got,
+        remedy="delete it; it is made again")  # fmt: skip
+
+
+def read_clip(folder: Path | ShardSource, city: int, clip: int, frames: Sequence[int]) -> Clip:
+    """Some frames of one clip of a shard, as a `Clip`. Shards hold no times: frame numbers stand for seconds."""
+    if isinstance(folder, Path):
+        return clip_at(shard_path(folder, city), clip, frames)
+    return folder.reading(city, lambda path: clip_at(path, clip, frames))
+
+
+def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
+    """The same, of the shard at `path`."""
+    with _open(path) as shard:
+        _check_arrays(shard, path)
+        clips, most = shard.get_slice("rgb").get_shape()[:2]
+        if not (0 <= clip < clips and 0 <= min(frames) and max(frames) < most):
+            raise InputError("a shard has fewer clips or frames", where=str(path), got=f"{clips} clips of {most} frames",
+                expected=f"clip {clip}, frame {max(frames)}", remedy="choose another --data.clips, or a smaller --data.window")  # fmt: skip
+        made = _read_part(shard, "", clip, frames, path)
+        if f"{FINE}place" not in shard.keys():
+            return made
+        row, column, scale = shard.get_slice(f"{FINE}place")[clip].tolist()
+        return replace(made, fine=FinePatch(_read_part(shard, FINE, clip, frames, path), row, column, scale))
+
+
+def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: Path) -> Clip:
+    """A clip, or its patch, from the arrays whose names begin with `prefix`."""
+    there = set(shard.keys())
+    if f"{prefix}effect" in there:
+        raise InputError("the clips are of generated cities in other weather, which are no longer learned from", got="an array effect",
+                         remedy="choose another folder of clips: it is filled anew")  # fmt: skip
+    rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
+    names = [
+        *_PER_FRAME,
+        *(name for name in ("point_color", "measured", "depth_confidence") if prefix + name in there),
+        *(_RENDERS if rendered else ()),
+    ]
+    found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
+    reference = torch.from_numpy(shard.get_slice(f"{prefix}reference")[clip])
+    shift_m = float(shard.get_tensor(f"{prefix}shift_m")[clip])
+    _check_values({**found, "shift_m": torch.tensor(shift_m)}, path)
+    image = lambda x: x.float() / 255  # noqa: E731
+    plane = lambda x: x.float().unsqueeze(1)  # noqa: E731
+    flags, (height, width) = found["flags"].unsqueeze(1), found["rgb"].shape[-2:]
+    views = tuple(
+        View(Camera("clip", width, height, *lens.tolist()), pose.numpy(), float(frame))
+        for frame, lens, pose in zip(frames, found["intrinsics"], found["world_from_cam"])
+    )
+    renders = None
+    if rendered:
+        renders = RenderPlanes(
+            image(found["render"]), plane(found["render_depth"]), plane(found["alpha"]) / 255, plane(found["certainty"]) / 255,
+            found["render_ids"].unsqueeze(1),
+        )  # fmt: skip
+    measured = plane(found["measured"]) if "measured" in found else None
+    condition = Condition(
+        views, image(found["color"]), plane(found["sparse_depth"]), (flags & FLAG_VALID) > 0, image(reference),
+        warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
+        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders,
+        measured=None if measured is None else SparseDepth(measured, measured > 0),
+    )  # fmt: skip
+    return Clip(
+        condition, image(found["rgb"]), plane(found["depth"]), (flags & FLAG_DEPTH_UNKNOWN) == 0, found["semantics"].long(), shift_m,
+        image(found["point_color"]) if "point_color" in found else None,
+        depth_confidence=plane(found["depth_confidence"]) / 255 if "depth_confidence" in found else None,
+    )  # fmt: skip
+
+
+def vary(clip: Clip, rng: np.random.Generator) -> Clip:
+    """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
+
+    Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
+    +-8 %; the condition gets a further exposure error of +-3 %.
+    Given classes: see `ClassMistakes`. A mirrored clip keeps its poses and intrinsics: they then describe the mirror image of the place.
+
+    Args:
+        clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way.
+    """
+    gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
+    gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
+    middle = float(clip.rgb.mean())
+    error = rng.uniform(0.97, 1.03)
+
+    def curve(x: Tensor, extra: float) -> Tensor:
+        x = x * torch.as_tensor(gain * extra, dtype=x.dtype).view(3, 1, 1)
+        x = x.clamp(1e-4, 1) ** gamma
+        grey = x.mean(-3, keepdim=True)
+        x = grey + saturation * (x - grey)
+        return (middle + contrast * (x - middle)).clamp(0, 1)
+
+    classes = ClassMistakes.drawn(rng)
+    mirrored = rng.random() < 0.5
+    without_renders = rng.random() < NO_RENDERS
+
+    def varied(one: Clip) -> Clip:
+        given = one.condition
+        colors = {n: curve(getattr(given, n), error) for n in ("color", "backdrop", "reference")}
+        ids = {n: classes.on(getattr(given, n)) for n in ("semantics", "backdrop_semantics")}
+        renders = None
+        if given.renders is not None and not without_renders:
+            shown = given.renders
+            renders = replace(shown, color=curve(shown.color, error), semantics=classes.on(shown.semantics))
+        made = replace(one, rgb=curve(one.rgb, 1.0), condition=replace(given, **colors, **ids, renders=renders))
+        return _mirrored(made) if mirrored else made
+
+    made = varied(clip)
+    if clip.fine is None:
+        return made
+    column = clip.fine.column
+    if mirrored:
+        column = clip.rgb.shape[-1] - column - clip.fine.clip.rgb.shape[-1] // clip.fine.scale
+    return replace(made, fine=replace(clip.fine, clip=varied(clip.fine.clip), column=column))
+
+
+def _mirrored(clip: Clip) -> Clip:
+    """The mirror image of a clip without its patch; the poses stay."""
+    flip = lambda x: x.flip(-1)  # noqa: E731
+    given = clip.condition
+    names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
+    turned = {name: flip(getattr(given, name)) for name in names}
+    renders = None if given.renders is None else given.renders.map(flip)
+    measured = None if given.measured is None else given.measured.map(flip)
+    own = {name: flip(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
+    if clip.depth_confidence is not None:
+        own["depth_confidence"] = flip(clip.depth_confidence)
+    return replace(clip, condition=replace(given, **turned, renders=renders, measured=measured), **own, shift_m=-clip.shift_m)
+
+
+NO_IDS, WORSE_IDS = 0.35, 0.25
+"""Shares of the training clips that get no classes, and classes with mistakes."""
+NO_RENDERS = 0.1
+"""Share of the training clips with renders that are used without."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClassMistakes:
+    """Given classes as a labeller might have made them: exact, none at all, or with mistakes.
+
+    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout (`table` u8[256], None = none are given), and blocks
+    of 8x8 pixels are unknown (`holes`: the share of the blocks, and the seed of the draw).
+    """
+
+    table: NDArray[np.uint8] | None
+    holes: tuple[float, int]
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> ClassMistakes:
+        """One way to be wrong."""
+        draw = rng.random()
+        if draw < NO_IDS:
+            return cls(None, (0.0, 0))
+        table = np.arange(256)
+        if draw >= NO_IDS + WORSE_IDS:
+            return cls(table.astype(np.uint8), (0.0, 0))
+        for number in range(19):
+            chance = rng.random()
+            table[number] = 255 if chance < 0.15 else int(rng.integers(19)) if chance < 0.23 else number
+        return cls(table.astype(np.uint8), (float(rng.uniform(0, 0.25)), int(rng.integers(2**31))))
+
+    def on(self, ids: Tensor) -> Tensor:
+        """Classes u8[T,1,H,W] with the mistakes."""
+        if self.table is None:
+            return torch.full_like(ids, 255)
+        worse = torch.from_numpy(self.table)[ids.long()]
+        share, seed = self.holes
+        if not share:
+            return worse
+        height, width = ids.shape[-2:]
+        blocks = seeds.numpy_rng(seed, 0, "holes").random((1, 1, -(-height // 8), -(-width // 8))) < share
+        holes = torch.from_numpy(blocks).repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width]
+        return torch.where(holes, torch.full_like(worse, 255), worse)

@@ -1,0 +1,129 @@
+"""Folders that hold a small diffusion model, and what every diffusion model's folder has in common.
+
+model.json                configuration, sha256 of the weight files, facts (recipe, scores); of published-type models also their kind
+weights_NN.safetensors    weights in fp16
+MODEL_CARD.md             for people
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mudg.base import checkpoint as shards
+from mudg.base import records, store
+from mudg.base.errors import InputError
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.networks.codec import SHIPPED
+
+MODEL_FILE = "model.json"
+EMBEDDED: dict[str, Path] = {"embedded": SHIPPED, "embedded-tiny": SHIPPED.with_name("mdm_tiny")}
+"""Models that come with the package, by the names that stand for their folders."""
+SHARD_BYTES = 15 * 1024 * 1024
+
+FORMER_FIELDS: dict[str, dict[str, Any]] = {
+    "top": {
+        "joint": True, "head": "x0", "copy_condition": True, "backdrop": True, "mask_planes": "valid_image", "reference": "warped",
+        "given_classes": True, "effects": 0,
+    },
+    "codec": {"kind": "patch", "depth_code": "log", "semantics_code": "shares"},
+}  # fmt: skip
+"""Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is still built."""
+
+LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": []}
+"""Fields that earlier model files lack, with what their models are."""
+
+
+def folder_of(path: Path | str) -> Path:
+    """The folder that a name of `EMBEDDED` stands for; any other text is a folder itself."""
+    return EMBEDDED.get(str(path), Path(path))
+
+
+def read_description(path: Path | str) -> dict[str, Any]:
+    """The content of a diffusion model's `model.json`, of whichever kind.
+
+    Raises:
+        InputError: no model there, or not a description of this version.
+    """
+    where = folder_of(path) / MODEL_FILE
+    if not where.is_file():
+        inside = (where.parent / "model" / MODEL_FILE).is_file()
+        raise InputError("no diffusion model here", where=str(where.parent), expected=f"a file {MODEL_FILE}",
+                         remedy=f"give {where.parent / 'model'}" if inside else "")  # fmt: skip
+    content = store.read_json(where)
+    known = isinstance(content, dict) and content.get("schema") == 1
+    if not known or not isinstance(content.get("files"), dict) or not isinstance(content.get("facts", {}), dict):
+        raise InputError("not a model description of this version", where=str(where))
+    return content
+
+
+def facts(path: Path | str) -> dict[str, Any]:
+    """The facts (recipe, scores) that `save` was given for a model folder or "embedded"."""
+    return dict(read_description(path).get("facts", {}))
+
+
+def digest(path: Path | str) -> str:
+    """Digest of a model's description, which holds the hashes of its weights."""
+    return store.digest(folder_of(path) / MODEL_FILE)
+
+
+def uses_renders(path: Path | str) -> bool:
+    """Whether a model's condition may hold renders of a fitted scene; published-type models' cannot."""
+    config = read_description(path).get("config")
+    return isinstance(config, Mapping) and bool(config.get("renders", LATER_FIELDS["renders"]))
+
+
+def config_from_dict(values: Any, where: str = "model configuration") -> MDMConfig:
+    """Inverse of `dataclasses.asdict`.
+
+    Raises:
+        InputError: names unknown or missing fields, a value of a wrong type, and a variant that is no longer built.
+    """
+
+    top = _without_former(values, "top", where)
+    if isinstance(top, Mapping):
+        top = {**LATER_FIELDS, **top, "codec": _without_former(top.get("codec"), "codec", f"{where}: codec")}
+    return records.parse_dataclass(MDMConfig, top, f"{where}: ")
+
+
+def _without_former(values: Any, group: str, where: str) -> Any:
+    """A group of a configuration without its `FORMER_FIELDS`; InputError for a variant that is no longer built."""
+    if not isinstance(values, Mapping):
+        return values
+    for name, value in FORMER_FIELDS[group].items():
+        if values.get(name, value) != value:
+            raise InputError("the model is of a variant that this version no longer has", where=f"{where}.{name}", expected=repr(value),
+                             got=repr(values[name]), remedy="train it anew with mudg learn")  # fmt: skip
+    return {name: value for name, value in values.items() if name not in FORMER_FIELDS[group]}
+
+
+def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
+    """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
+    with store.atomic_directory(folder) as partial:
+        files = shards.write_shards(partial, model.state_dict(), SHARD_BYTES, torch.float16)
+        store.write_text(partial / "MODEL_CARD.md", card)
+        description = {"schema": 1, "config": dataclasses.asdict(model.config), "files": files, "facts": dict(facts)}
+        store.write_json(partial / MODEL_FILE, description)
+        store.sync_tree(partial)
+
+
+def load(path: Path | str = "embedded") -> MDM:
+    """Read a model folder written by `save`; the names of `EMBEDDED` stand for those shipped with the package.
+
+    Raises:
+        InputError: no model there, other fields or other weights than the configuration implies.
+        IntegrityError: a weight file does not match its recorded hash.
+    """
+    folder = folder_of(path)
+    content = read_description(folder)
+    config, state = config_from_dict(content.get("config"), str(folder / MODEL_FILE)), shards.read_shards(folder, content["files"])
+    with records.understood("a diffusion model", str(folder / MODEL_FILE)):
+        with torch.device("meta"):  # takes no memory: its size may be anything
+            shards.check_fit(state, MDM(config).state_dict(), folder)
+        model = MDM(config)
+    model.load_state_dict(state)  # the numbers are converted as they are copied: no second set of them is in memory
+    return model.eval()

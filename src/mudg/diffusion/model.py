@@ -1,0 +1,558 @@
+"""The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
+
+Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to do,
+`encode_condition`, `loss` and `sample`. The network and the step from latents to pixels are in
+`models.mdm.network`, reading and writing in `models.mdm.files`.
+
+The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition | backdrop | masks of
+what was seen | classes of the condition]. It states the clean latents of all modalities at once, and may copy the condition's own.
+
+Layouts: conditions and samples [T,C,H,W] of one clip; inside the model [B,T,C,h,w], with (h, w) the latent size; inside
+the UNet [B*T,C,h,w] stored channels-last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.base import palette, scratch, seeds
+from mudg.base.crop import cropped
+from mudg.base.errors import UsageError
+from mudg.base.types import Clip, Condition, FinePatch
+from mudg.core import losses, noise
+from mudg.core.depth import align_depth
+from mudg.core.noise import Schedule
+from mudg.diffusion.finisher import Finisher, Made, class_scores, finish_in_tiles
+from mudg.diffusion.network import (  # fmt: skip
+    ConditionPixels,
+    MDMConfig,
+    PixelTruth,
+    Refined,
+    Refiner,
+    TemporalAttention,
+    UNet,
+)
+from mudg.diffusion.requests import (  # fmt: skip
+    GeneratedClip,
+    SampleRequest,
+    StartClip,
+    check_image_size,
+    confidence_of,
+    denoised,
+    depth_agreement,
+    mean_change,
+    settle_depth,
+    sized_to_area,
+    sized_to_width,
+)
+from mudg.diffusion.stacked import Stacked, cell_means, cell_shares
+from mudg.networks.codec import (  # fmt: skip
+    CLASSES,
+    MODALITIES,
+    Decoded,
+    Modality,
+    PatchCodec,
+    code_to_depth,
+    semantic_shares,
+)
+
+SKY = palette.ID["sky"]
+
+
+# model ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConditionLatents:
+    """A batch of conditions as the network wants them.
+
+    planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
+    [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
+    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of models that use
+    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
+    """
+
+    planes: Tensor
+    copy: dict[Modality, Tensor]
+    backdrop: Tensor
+    seen: dict[Modality, Tensor]
+    pixels: ConditionPixels
+    render: dict[Modality, Tensor] = field(default_factory=dict)
+    certainty: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class BatchPart:
+    """Clips number `first` and following of the `count` clips of a training step. Whatever training draws for a clip depends on
+    (seed, step, its number), and not on how the step's batch is divided."""
+
+    seed: int
+    step: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """What a training run says about the loss.
+
+    class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
+    refined_share      share of each side of the image on which the refiner is trained at a step
+    reference_dropout  share of the clips that go without their reference image; the published kind
+    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the published kind
+    """
+
+    class_weights: Tensor | None
+    refined_share: float
+    reference_dropout: float
+    frame_dropout: bool = False
+
+
+@dataclass(frozen=True)
+class EncodedTruth:
+    """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of the cell with
+    valid depth; and all of it at pixel resolution."""
+
+    latents: dict[Modality, Tensor]
+    shares: Tensor
+    depth_known: Tensor
+    pixels: PixelTruth
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Loss of a batch: `total` scalar with gradient; `terms` the weighted parts as floats."""
+
+    total: Tensor
+    terms: dict[str, float]
+
+
+TRUSTED_ERROR = 0.08
+"""Expected error of the colour (of 1) at which the confidence is 1/e; models with a refiner."""
+
+COPY_BIAS = 4.0
+"""Start value of the copy gates' logits where the cell is seen (minus this for the backdrop); 0 where it is not."""
+
+CONDITION_PLANES = 3 * 4 + 2 * PatchCodec.factor**2 + CLASSES + 1
+"""Planes of a condition: latents of colour, depth and backdrop, two masks at pixel resolution, class shares and their sum."""
+
+GATES = 4
+"""Outputs that say how much of the condition is copied: its colour, its depth, the backdrop's colour, its classes."""
+
+RENDER_PLANES = 2 * 4 + 2 + CLASSES + 1
+"""Further planes of models that use renders: latents of their colour and depth, coverage and certainty, class shares and their
+sum."""
+
+RENDER_GATES = 2
+"""Their further outputs: how much of the render's colour and of its depth is copied."""
+
+SURROUNDINGS = 8
+"""Latent cells beside a patch that are refined with it in training. What lies farther away changes the losses by 1e-4 of their value."""
+
+LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
+"""Weights of the modalities in the joint loss."""
+
+
+class MDM(nn.Module):
+    """The multi-modal diffusion model (see the module text). Weights are random until `files.load` or `learn` sets them."""
+
+    points_alone = False
+    """The condition is filled, and recorded images are warped into it."""
+
+    def __init__(self, config: MDMConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.codec = PatchCodec(config.codec)
+        self.schedule = Schedule(config.schedule)
+        noisy = sum(self.codec.channels.values())
+        further = (RENDER_PLANES, RENDER_GATES) if config.renders else (0, 0)
+        self.net = UNet(config, noisy + CONDITION_PLANES + further[0], noisy + GATES + further[1])
+        self.net.to(memory_format=torch.channels_last)
+        self.refiner: Refiner | None = None
+        if config.refine_widths:
+            (fine, coarse), (outer, inner) = config.refine_widths, config.refine_blocks
+            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner), config.renders).to(memory_format=torch.channels_last)
+        self.finisher: Finisher | None = None
+        if config.finish_widths:
+            (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
+            self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        return self.codec.rgb_mean.device
+
+    # inputs -----------------------------------------------------------------------------------------------------------
+
+    def check_size(self, height: int, width: int) -> None:
+        """UsageError unless an image of this size fits the network's strides."""
+        check_image_size(height, width, self.config.pixel_multiple)
+
+    def check_clip(self, frames: int, height: int, width: int) -> None:
+        """UsageError unless the model can make clips of this image size; any number of frames will do."""
+        del frames
+        self.check_size(height, width)
+
+    def encode_condition(self, condition: Condition | Sequence[Condition]) -> ConditionLatents:
+        """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`).
+
+        A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
+        unknown classes.
+        """
+        given = Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
+        color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
+        self.check_size(*color.shape[-2:])
+        factor = self.codec.factor
+        copy: dict[Modality, Tensor] = {
+            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": cell_shares(ids),
+        }  # fmt: skip
+        seen: dict[Modality, Tensor] = {
+            "rgb": cell_means(torch.maximum(valid, warped), factor), "depth": cell_means(valid, factor),
+            "semantics": copy["semantics"].sum(2, keepdim=True),
+        }  # fmt: skip
+        far = self.codec.encode_rgb(given.backdrop)
+        masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
+        planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
+        pixels = self._pixels_of(given)
+        if not self.config.renders:
+            return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
+        shown = given.renders
+        render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
+        classes, certainty = cell_shares(shown.semantics), cell_means(shown.certainty, factor)
+        alpha = cell_means(shown.alpha, factor)
+        planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
+        return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels, render, certainty)
+
+    def _pixels_of(self, given: Stacked) -> ConditionPixels:
+        """What the refiner sees of a batch of conditions, [B*T,..]."""
+        code = self.codec.linear_depth_code
+        pixels = [
+            given.color * 2 - 1, given.backdrop * 2 - 1, code(given.depth), given.valid, given.warped, given.ids, given.backdrop_ids
+        ]  # fmt: skip
+        if self.config.renders:
+            shown = given.renders
+            pixels += [shown.color * 2 - 1, code(shown.depth), shown.alpha, shown.certainty, shown.semantics]
+        return ConditionPixels(*(x.flatten(0, 1) for x in pixels))
+
+    # network ----------------------------------------------------------------------------------------------------------
+
+    def predict(
+        self, x: dict[Modality, Tensor], encoded: ConditionLatents, t: Tensor
+    ) -> tuple[dict[Modality, Tensor], Tensor]:
+        """One pass of the network over the noisy latents `x` [B,T,C,h,w] of all modalities at steps `t` i64[B].
+
+        Returns the clean latents it states, and the log-shares of the classes [B,T,19,h,w].
+        """
+        sizes = [x[m].shape[2] for m in MODALITIES]
+        given = torch.cat([*(x[m] for m in MODALITIES), encoded.planes], 2)
+        out, gates = self.net(given, t).split([sum(sizes), GATES + (RENDER_GATES if encoded.render else 0)], 2)
+        copy_rgb, copy_depth, copy_far, copy_classes, *copy_render = gates.split(1, 2)
+        rgb, depth, classes = out.split(sizes, 2)
+        if encoded.certainty is not None:
+            opening = COPY_BIAS * (2 * encoded.certainty - 2)
+            rgb = rgb + (copy_render[0] + opening).sigmoid() * encoded.render["rgb"]
+            depth = depth + (copy_render[1] + opening).sigmoid() * encoded.render["depth"]
+        rgb = rgb + (copy_rgb + COPY_BIAS * encoded.seen["rgb"]).sigmoid() * encoded.copy["rgb"]
+        depth = depth + (copy_depth + COPY_BIAS * encoded.seen["depth"]).sigmoid() * encoded.copy["depth"]
+        rgb = rgb + (copy_far - COPY_BIAS * encoded.seen["rgb"]).sigmoid() * encoded.backdrop
+        log_shares = (classes + 4.0 * copy_classes.sigmoid() * encoded.copy["semantics"]).log_softmax(2)
+        return {"rgb": rgb, "depth": depth, "semantics": self.codec.shares_to_latent(log_shares.exp())}, log_shares
+
+    # training ---------------------------------------------------------------------------------------------------------
+
+    def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
+        """Denoising loss of clips of one size; all that is drawn comes from `part`.
+
+        Squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a clip; cross-entropy for class
+        shares. Steps are stratified over the batch. Where depth is not valid it has no part.
+        With a refiner its terms are added, and their gradient reaches the denoiser.
+        """
+        with torch.no_grad():
+            encoded = self.encode_condition([clip.condition for clip in clips])
+            truth = self.encode_truth(clips)
+        generator = seeds.torch_generator(part.seed, part.step, "noise")
+        steps = noise.stratified_steps(part.count, len(self.schedule), generator)
+        t = steps[part.first : part.first + len(clips)].to(truth.shares.device)
+        weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
+        eps = {m: self._clip_noise(truth.latents[m], generator.initial_seed(), part.first, m) for m in MODALITIES}
+        x = {m: self.schedule.add_noise(truth.latents[m], eps[m], t) for m in MODALITIES}
+        stated, log_shares = self.predict(x, encoded, t)
+        errors = {
+            "rgb": losses.latent_error(stated["rgb"], truth.latents["rgb"], weight),
+            "depth": losses.latent_depth_error(stated["depth"], truth.latents["depth"], weight, truth.depth_known),
+            "semantics": losses.share_cross_entropy(log_shares, truth.shares, settings.class_weights),
+        }
+        terms = {m: float(error.detach()) for m, error in errors.items()}
+        total = sum(LOSS_SHARES[m] * errors[m] for m in MODALITIES)
+        if self.refiner is not None:
+            errors = self._refiner_terms(stated, encoded, truth.pixels, part, settings)
+            errors |= self._finisher_terms(stated, encoded, clips, settings)
+            terms |= {name: float(error.detach()) for name, error in errors.items()}
+            total = total + sum(errors.values())
+        return Losses(total, terms)  # type: ignore[arg-type]
+
+    forward = loss
+    """What `DistributedDataParallel` calls, to exchange gradients behind it."""
+
+    def encode_truth(self, clips: Sequence[Clip]) -> EncodedTruth:
+        """What `loss` compares with."""
+        rgb, depth, valid, ids = (
+            torch.stack([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+        )
+        pixels = self.pixel_truth(clips)
+        latents: dict[Modality, Tensor] = {
+            "rgb": self.codec.encode_rgb(rgb), "depth": self.codec.encode_depth(depth),
+            "semantics": self.codec.encode_semantics(ids),
+        }  # fmt: skip
+        cells = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, valid.shape[:2])
+        return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
+
+    def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
+        """What the refiner should give for clips or patches of one size."""
+        rgb, depth, weight, ids = (
+            torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
+        )
+        return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, weight)
+
+    def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
+        """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""
+        shape = (1, *like.shape[1:])
+        draws = [
+            noise.video_noise(shape, seeds.torch_generator(seed, first + i, name), self.config.shared_noise)
+            for i in range(len(like))
+        ]
+        return torch.cat(draws).to(like.device)
+
+    def _refiner_terms(
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, truth: PixelTruth, part: BatchPart, settings: LossSettings
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
+        frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
+        cells = self._refined_window(part, settings.refined_share, h, w)
+        latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
+        factor = self.codec.factor
+        tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
+        made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
+        return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
+
+    def _finisher_terms(
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], settings: LossSettings
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from them."""
+        patches = [(number, clip.fine) for number, clip in enumerate(clips) if clip.fine is not None]
+        if self.finisher is None or not patches:
+            return {}
+        frames = stated["rgb"].shape[1]
+        with torch.no_grad():
+            enlarged = [self._enlarged(stated, encoded, number, patch) for number, patch in patches]
+            made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
+            given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
+            truth = self.pixel_truth([patch.clip for _, patch in patches])
+            scale = torch.tensor([float(patch.scale) for _, patch in patches], device=made.rgb.device).repeat_interleave(frames)
+        done = self.finisher(made, given, frames, scale)
+        found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
+        return self._pixel_terms(found, truth, settings, "fine")
+
+    def _enlarged(self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch) -> Made:
+        """What denoiser and refiner make of the patch of clip `number`, at the patch's size. Only its surroundings are refined."""
+        frames, *cells = stated["rgb"].shape[1], *stated["rgb"].shape[-2:]
+        factor, own = self.codec.factor, slice(number, number + 1)
+        starts, sides = (patch.row, patch.column), (side // patch.scale for side in patch.clip.rgb.shape[-2:])
+        around = [_around(start, side, factor, count) for start, side, count in zip(starts, sides, cells, strict=True)]
+        tall, wide = (slice(cut.start * factor, cut.stop * factor) for cut in around)
+        latents: dict[Modality, Tensor] = {m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()}
+        pixels = encoded.pixels.map(lambda x: x[number * frames : (number + 1) * frames]).crop(tall, wide)
+        small = self._made(self.refine(latents, pixels, frames))
+        size = (tall.stop - tall.start) * patch.scale, (wide.stop - wide.start) * patch.scale
+        top, left = (patch.row - tall.start) * patch.scale, (patch.column - wide.start) * patch.scale
+        return small.enlarged(size, (top, top + patch.clip.rgb.shape[-2]), (left, left + patch.clip.rgb.shape[-1]))
+
+    def _made(self, refined: Refined) -> Made:
+        """What the finisher starts from."""
+        ids = refined.scores.argmax(1, keepdim=True).to(torch.uint8)
+        return Made(refined.rgb, refined.depth_code, ids, refined.log_error)
+
+    def _pixel_terms(self, made: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
+        """Weighted terms of refined pixels; depth in the sky counts threefold."""
+        codec = self.config.codec
+        log_per_code = math.log(codec.far_m / codec.near_m) / 2
+        counted = (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1)) * truth.depth_known
+        error = made.rgb - truth.rgb
+        return {
+            f"{name}_rgb": losses.image_error(error, square=2.0, gradient=0.5),
+            f"{name}_depth": losses.depth_code_error(made.depth_code, truth.depth_code, counted, log_per_code),
+            f"{name}_semantics": 0.2 * losses.class_error(made.scores, truth.ids, settings.class_weights),
+            f"{name}_error": 0.05 * losses.stated_error(made.log_error, error),
+        }
+
+    @staticmethod
+    def _refined_window(part: BatchPart, share: float, height: int, width: int) -> tuple[slice, slice]:
+        """Rows and columns of latent cells on which the refiner is trained at a step: a share of each side, anywhere."""
+        rng = seeds.numpy_rng(part.seed, part.step, "refined window")
+        spans = []
+        for cells in (height, width):
+            size = min(cells, max(8, round(cells * share / 8) * 8))
+            start = 2 * int(rng.integers((cells - size) // 2 + 1))
+            spans.append(slice(start, start + size))
+        return spans[0], spans[1]
+
+    def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
+        if self.refiner is None:
+            raise UsageError("this model has no refiner", where="MDM.refine")
+        return self.refiner(self.codec, latents, given, frames)
+
+    def trained_part(self) -> nn.ModuleDict:
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner and finisher."""
+        parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher}
+        return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
+
+    def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
+        """Names in `trained_part` of the parameters that mix frames: of the temporal attentions, or of `all` temporal layers.
+
+        This network has no temporal layers with parameters besides its attentions.
+        """
+        del which
+        kinds = {name for name, module in self.trained_part().named_modules() if isinstance(module, TemporalAttention)}
+        return {f"{owner}.{name}" for owner in kinds for name, _ in self.trained_part().get_submodule(owner).named_parameters()}
+
+    # sampling ---------------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def check_request(request: SampleRequest) -> None:
+        """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
+        request.sampler_settings()
+        if request.guidance is not None or request.guidance_rescale is not None:
+            raise UsageError("only published-type models have guidance", where="guidance, guidance_rescale",
+                             got=f"{request.guidance}, {request.guidance_rescale}", remedy="leave them out")  # fmt: skip
+
+    def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
+        """Width and height the model works at for a camera of width x height: about the area it was trained at, or about
+        `width_px` wide, in the camera's aspect."""
+        aspect, multiple = width / height, self.config.pixel_multiple
+        if width_px:
+            return sized_to_width(width_px, aspect, multiple)
+        return sized_to_area(self.config.area_px, aspect, multiple)
+
+    @torch.no_grad()
+    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
+        """Generate one clip (see `SampleRequest`).
+
+        Condition and clip are on the model's device. The condition has T views; H and W are multiples of `config.pixel_multiple`.
+        Frames of which `request.known` has latents keep them. Measured depth (`condition.valid`) replaces generated depth.
+        """
+        self.check_request(request)
+        encoded = self.encode_condition(condition)
+        drawn, change = self._denoise(encoded, request)
+        latents, log_error = {m: z[0] for m, z in drawn.items()}, None
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=request.bf16):
+            if self.refiner is None:
+                decoded = self.codec.decode(latents)
+                confidence = confidence_of(encoded.seen["rgb"][0], change[0], self.codec.factor)
+            else:
+                pixels = encoded.pixels
+                del encoded  # its planes are large
+                made = self._made(self.refine(latents, pixels, len(condition.views)))
+                decoded, log_error = self._decoded(made), made.log_error
+                confidence = torch.exp(-_expected_error(log_error) / TRUSTED_ERROR)
+        depth, fits = decoded.depth, []
+        if request.align:
+            depth, fits = align_depth(depth, condition.depth, condition.valid)
+        confidence = confidence * depth_agreement(depth, condition)
+        depth = settle_depth(depth, condition, self.config.codec.far_m)
+        return GeneratedClip(decoded.rgb, depth, decoded.semantics, confidence, latents, tuple(fits), log_error)
+
+    @torch.no_grad()
+    def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
+        """A generated clip at the size of `fine`, the same views' condition at the camera's resolution (any size).
+
+        Measured depth replaces generated depth, as in `sample`; latents and depth fits stay those of the clip.
+
+        Raises:
+            UsageError: the model has no finisher, or `clip` does not come from `sample`.
+        """
+        if self.finisher is None or clip.log_error is None:
+            raise UsageError("this model has no finisher, or the clip is another model's", where="MDM.finish")
+        code = self.codec.linear_depth_code(clip.depth)
+        made = Made(clip.rgb * 2 - 1, code, clip.semantics.unsqueeze(1).to(torch.uint8), clip.log_error)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
+            made = finish_in_tiles(self.finisher, made, _FinePixels(self, fine), detail=True)
+        decoded = self._decoded(made)
+        confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
+        depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
+        return replace(
+            clip, rgb=decoded.rgb, depth=depth, semantics=decoded.semantics, confidence=confidence, log_error=made.log_error
+        )  # fmt: skip
+
+    def _decoded(self, made: Made) -> Decoded:
+        """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its colour over."""
+        return Decoded(made.rgb.add_(1).div_(2).clamp_(0, 1), code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
+
+    def _denoise(self, encoded: ConditionLatents, request: SampleRequest) -> tuple[dict[Modality, Tensor], Tensor]:
+        """Draw a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
+        lead, cell = encoded.planes.shape[:2], encoded.planes.shape[-2:]
+        sizes = [self.codec.channels[m] for m in MODALITIES]
+        generator = torch.Generator().manual_seed(seeds.key(request.seed, request.index * 64, "sample"))
+        device, shared = encoded.planes.device, self.config.shared_noise
+        draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)  # noqa: E731
+        known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)
+        begun = None if request.start is None else self._encode_start(request.start, device)
+
+        def denoise(x: Tensor, t: int) -> Tensor:
+            at = torch.full((lead[0],), t, device=device)
+            stated, _ = self.predict(dict(zip(MODALITIES, x.split(sizes, 2))), encoded, at)
+            out = torch.cat([stated[m].float() for m in MODALITIES], 2)
+            if begun is not None:  # a pixel moves once the noise has come down to its share
+                out = torch.where(begun[1] * len(self.schedule) >= t + 1, out, begun[0])
+            return out if known is None else torch.cat([known, out[:, known.shape[1] :]], 1)
+
+        with torch.autocast(device.type, torch.bfloat16, enabled=request.bf16):  # around all steps: the weights are converted once
+            x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
+        color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
+        return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
+
+    def _encode_start(self, start: StartClip, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Latents [1,T,C,h,w] of the clip that a sample begins from, and the freedom f32[1,T,1,h,w] of their cells."""
+        rgb, depth, ids = (x[None].to(device) for x in (start.rgb, start.depth, start.semantics))
+        shares = self.codec.shares_to_latent(cell_shares(ids))
+        latents = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
+        freedom = functional.max_pool2d(start.freedom.to(device), self.codec.factor)[None]
+        return latents, freedom
+
+
+@dataclass(frozen=True)
+class _FinePixels:
+    """A condition at the camera's resolution; what the finisher reads of it is made tile by tile, for all of it is large."""
+
+    model: MDM
+    fine: Condition
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """Frames, height, width."""
+        return len(self.fine.views), int(self.fine.color.shape[-2]), int(self.fine.color.shape[-1])
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        found = cropped(self.fine, rows, columns)
+        scratch.rest_mapped()
+        return self.model._pixels_of(Stacked.of([found]))
+
+
+def _around(start_px: int, side_px: int, factor: int, count: int) -> slice:
+    """The latent cells, of `count`, of a span of pixels with `SURROUNDINGS`; whole pairs, as the refiner's inner blocks take them."""
+    first = max(0, start_px // factor - SURROUNDINGS)
+    last = min(count, -(-(start_px + side_px) // factor) + SURROUNDINGS)
+    return slice(first - first % 2, last + last % 2)
+
+
+def _expected_error(log_error: Tensor) -> Tensor:
+    """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
+    return log_error.clamp(-6, 1).exp() / 2

@@ -1,0 +1,462 @@
+"""The networks of the small models: the denoiser, and the refiner that goes from latents to pixels.
+
+`UNet` is a U of residual blocks with attention over the cells of a patched latent video; `UNetStage` is one block with the
+attentions of its level. Frames of a clip are told apart by a free temporal shift of channels in every block, keys and values from
+frame 0, and temporal attention at the lowest level.
+
+The latent code has a quarter of the image's places and loses texture, one axis of hue and whatever is one pixel wide; the
+condition has all of it wherever something was seen. The `Refiner` reads both and states, for every pixel, how much of the
+condition's colour, depth and class to take over, what to add, and how wrong the colour will probably be. It runs once per
+clip, after the last denoising step, and is trained together with the denoiser, on what the denoiser makes. All its maps are held at
+the latent resolution, the 2x2 pixels of a cell as channels (`functional.pixel_unshuffle`).
+
+`MDMConfig` is all that distinguishes one model from another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.base.errors import UsageError
+from mudg.core.noise import ScheduleConfig
+from mudg.networks.codec import (  # fmt: skip
+    CLASSES,
+    MODALITIES,
+    ChannelNorm,
+    CodecConfig,
+    DecoderBlock,
+    Modality,
+    PatchCodec,
+    temporal_shift,
+)
+
+COPY_SCORE = 6.0
+"""What a class given by the condition adds to its score when the gate is open."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MDMConfig:
+    """Everything that fixes a model's function except its weights. What `LearnConfig` states has its default there alone."""
+
+    codec: CodecConfig = CodecConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    patch: int
+    """Latent cells per side of one network cell."""
+    widths: tuple[int, ...]
+    blocks: tuple[int, ...]
+    spatial_attention: tuple[bool, ...]
+    temporal_attention: tuple[bool, ...]
+    head_width: int = 32
+    embed_width: int = 192
+    refine_widths: tuple[int, ...]
+    """Channels of the refiner (see `Refiner`) at the latent resolution and at half of it; empty = no refiner."""
+    refine_blocks: tuple[int, ...]
+    window: int
+    """Frames per clip the model was made for; other numbers work, only this one is tested."""
+    area_px: int
+    """Pixels per frame that the model was trained at."""
+    shared_noise: float = 0.3
+    """Share of the noise variance common to all frames, in training and sampling."""
+    renders: bool = False
+    """Whether the condition may hold renders of a fitted scene."""
+    finish_widths: tuple[int, ...] = ()
+    """Channels of the finisher (`models.mdm.finisher`) at half and at a quarter of the camera's resolution; empty = no finisher."""
+    finish_blocks: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
+        if len(levels) != 1:
+            raise UsageError(
+                "widths, blocks and attention switches must have one entry per level", got=f"{sorted(levels)}"
+            )
+        attended = zip(self.widths, self.spatial_attention, self.temporal_attention)
+        if any((spatial or temporal) and width % self.head_width for width, spatial, temporal in attended):
+            raise UsageError("a width is no multiple of the attention head width", got=f"{self.widths}")
+        if (len(self.refine_widths), len(self.refine_blocks)) not in ((0, 0), (2, 2)):
+            raise UsageError(
+                "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
+            )
+        if (len(self.finish_widths), len(self.finish_blocks)) not in ((0, 0), (2, 2)):
+            raise UsageError("finish_widths and finish_blocks have two entries each, or none", got=str(self.finish_widths))
+        if self.finish_widths and not (self.refine_widths and self.renders):
+            raise UsageError("a finisher needs a refiner before it, and renders", got=f"renders {self.renders}, {self.refine_widths}")
+
+    @property
+    def pixel_multiple(self) -> int:
+        """Image sides must be multiples of this many pixels."""
+        return 2 * self.patch * 2 ** (len(self.widths) - 1)
+
+
+# denoiser -------------------------------------------------------------------------------------------------------------
+
+
+def sinusoid(t: Tensor, width: int) -> Tensor:
+    """[cos, sin] features f32[N,width] of `t` [N], frequencies 10000^(-i / (width/2))."""
+    half = width // 2
+    frequencies = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device) / half)
+    angles = t.float()[:, None] * frequencies
+    return torch.cat([angles.cos(), angles.sin()], 1)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """Softmax attention of `q` [..,N,C] over `k`, `v` [..,M,C] -> [..,N,C].
+
+    In training as two matrix products (on CPUs the backward pass of the fused kernel costs several times more at these
+    sizes), otherwise through the fused kernel, which never stores the N x M scores.
+    """
+    if torch.is_grad_enabled():
+        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+        return scores.softmax(-1).to(v.dtype) @ v
+    return functional.scaled_dot_product_attention(q, k, v)
+
+
+class UNetBlock(nn.Module):
+    """norm - temporal shift - conv - norm scaled and moved by the embedding - SiLU - conv, around a residual."""
+
+    def __init__(self, inside: int, outside: int, embed: int) -> None:
+        super().__init__()
+        self.norm1 = ChannelNorm(inside)
+        self.conv1 = nn.Conv2d(inside, outside, 3, padding=1)
+        self.norm2 = ChannelNorm(outside, elementwise_affine=False)
+        self.modulate = nn.Linear(embed, 2 * outside)
+        self.conv2 = nn.Conv2d(outside, outside, 3, padding=1)
+        self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
+        nn.init.zeros_(self.conv2.weight)
+        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
+        scale, move = self.modulate(embedding)[:, :, None, None].chunk(2, 1)
+        h = self.conv1(temporal_shift(self.norm1(x), frames))
+        h = functional.silu(torch.addcmul(move, self.norm2(h), 1 + scale))
+        return self.skip(x) + self.conv2(h)
+
+
+class SpatialAttention(nn.Module):
+    """Self-attention over the cells of a frame; keys and values also come from frame 0 of the clip."""
+
+    def __init__(self, width: int, head_width: int) -> None:
+        super().__init__()
+        self.heads = width // head_width
+        self.norm = nn.LayerNorm(width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, width)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same."""
+        n, c, height, width = x.shape
+        tokens = x.permute(0, 2, 3, 1).reshape(n, height * width, c)
+        normed = self.norm(tokens)
+        key_value = self.key_value(normed)
+        if frames > 1:
+            per_clip = key_value.unflatten(0, (n // frames, frames))
+            first = per_clip[:, :1].expand(-1, frames, -1, -1)
+            key_value = torch.cat([per_clip, first], 2).flatten(0, 1)
+        key, value = key_value.chunk(2, -1)
+        q, k, v = (y.unflatten(-1, (self.heads, -1)).transpose(1, 2) for y in (self.query(normed), key, value))
+        mixed = attend(q, k, v).transpose(1, 2).flatten(2)
+        return (tokens + self.out(mixed)).reshape(n, height, width, c).permute(0, 3, 1, 2)
+
+
+class TemporalAttention(nn.Module):
+    """Self-attention over the frames of a clip at each cell."""
+
+    def __init__(self, width: int, head_width: int) -> None:
+        super().__init__()
+        self.heads = width // head_width
+        self.norm = nn.LayerNorm(width)
+        self.mix = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same."""
+        n, c, height, width = x.shape
+        y = x.permute(0, 2, 3, 1).reshape(n // frames, frames, height * width, c).transpose(1, 2)
+        place = sinusoid(torch.arange(frames, device=x.device), c).to(y.dtype)
+        q, k, v = self.mix(self.norm(y) + place).unflatten(-1, (3, self.heads, -1)).movedim(-3, 0)
+        q, k, v = (z.transpose(-3, -2).flatten(0, 1) for z in (q, k, v))
+        mixed = attend(q, k, v)
+        mixed = mixed.unflatten(0, y.shape[:2]).transpose(-3, -2).flatten(-2)
+        y = (y + self.out(mixed)).transpose(1, 2).reshape(n, height, width, c)
+        return y.permute(0, 3, 1, 2)
+
+
+class UNetStage(nn.Module):
+    """One residual block and the attentions that its level has."""
+
+    def __init__(self, inside: int, outside: int, config: MDMConfig, level: int) -> None:
+        super().__init__()
+        self.block = UNetBlock(inside, outside, config.embed_width)
+        spatial, temporal = config.spatial_attention[level], config.temporal_attention[level]
+        self.spatial = SpatialAttention(outside, config.head_width) if spatial else None
+        self.temporal = TemporalAttention(outside, config.head_width) if temporal else None
+
+    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
+        x = self.block(x, embedding, frames)
+        if self.spatial is not None:
+            x = self.spatial(x, frames)
+        if self.temporal is not None:
+            x = self.temporal(x, frames)
+        return x
+
+
+class UNet(nn.Module):
+    """The denoising network of the small models: a U of `UNetStage`s over the cells of a patched latent video."""
+
+    def __init__(self, config: MDMConfig, planes_in: int, planes_out: int) -> None:
+        super().__init__()
+        widths, embed, area = config.widths, config.embed_width, config.patch**2
+        self.patch = config.patch
+        self.time = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
+        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))  # of label 0: all modalities at once
+        self.enter = nn.Conv2d(planes_in * area, widths[0], 1)
+        width, skips = widths[0], [widths[0]]
+        self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
+        for level, outside in enumerate(widths):
+            stages = nn.ModuleList()
+            for _ in range(config.blocks[level]):
+                stages.append(UNetStage(width, outside, config, level))
+                width = outside
+                skips.append(width)
+            self.down.append(stages)
+            if level + 1 < len(widths):
+                self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
+                width = widths[level + 1]
+                skips.append(width)
+        self.middle = UNetStage(width, width, config, len(widths) - 1)
+        self.up, self.grow = nn.ModuleList(), nn.ModuleList()
+        for level in reversed(range(len(widths))):
+            stages = nn.ModuleList()
+            for _ in range(config.blocks[level] + 1):
+                stages.append(UNetStage(width + skips.pop(), widths[level], config, level))
+                width = widths[level]
+            self.up.append(stages)
+            if level:
+                self.grow.append(nn.Conv2d(width, 4 * widths[level - 1], 1))
+                width = widths[level - 1]
+        self.norm = ChannelNorm(width)
+        self.leave = nn.Conv2d(width, planes_out * area, 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        """`x` [B,T,planes_in,h,w], `t` i64[B] -> f32 [B,T,planes_out,h,w]."""
+        batch, frames = x.shape[:2]
+        embedding = self.time(sinusoid(t, 64)) + self.label(sinusoid(torch.zeros_like(t), 64))
+        embedding = functional.silu(embedding).repeat_interleave(frames, 0)
+        h = functional.pixel_unshuffle(x.flatten(0, 1), self.patch)
+        h = self.enter(h.contiguous(memory_format=torch.channels_last))
+        skips = [h]
+        for level, stages in enumerate(self.down):
+            for stage in stages:
+                h = stage(h, embedding, frames)
+                skips.append(h)
+            if level < len(self.shrink):
+                h = self.shrink[level](h)
+                skips.append(h)
+        h = self.middle(h, embedding, frames)
+        for index, stages in enumerate(self.up):
+            for stage in stages:
+                h = stage(torch.cat([h, skips.pop()], 1), embedding, frames)
+            if index < len(self.grow):
+                h = functional.pixel_shuffle(self.grow[index](h), 2).contiguous(memory_format=torch.channels_last)
+        h = self.leave(functional.silu(self.norm(h)))
+        return functional.pixel_shuffle(h.float(), self.patch).unflatten(0, (batch, frames))
+
+
+# refiner --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConditionPixels:
+    """The condition at pixel resolution: color, backdrop f32[N,3,H,W] in [-1,1]; depth_code f32[N,1,H,W]; valid, warped
+    f32[N,1,H,W]; ids, backdrop_ids u8[N,1,H,W], 255 = unknown. N = clips times frames. For models that use renders also
+    render f32[N,3,H,W] in [-1,1], render_code f32[N,1,H,W] (depth), alpha, certainty f32[N,1,H,W] (alpha -1: no
+    renders), render_ids u8[N,1,H,W]."""
+
+    color: Tensor
+    backdrop: Tensor
+    depth_code: Tensor
+    valid: Tensor
+    warped: Tensor
+    ids: Tensor
+    backdrop_ids: Tensor
+    render: Tensor | None = None
+    render_code: Tensor | None = None
+    alpha: Tensor | None = None
+    certainty: Tensor | None = None
+    render_ids: Tensor | None = None
+
+    @property
+    def grid(self) -> tuple[int, int, int]:
+        """N, H, W."""
+        return len(self.color), int(self.color.shape[-2]), int(self.color.shape[-1])
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        return self.map(lambda x: x[..., rows, columns])
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> ConditionPixels:
+        """The same with ``change`` applied to every tensor."""
+        parts = (getattr(self, f.name) for f in fields(self))
+        return ConditionPixels(*(None if x is None else change(x) for x in parts))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Pixels: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], class scores f32[N,19,H,W] (none of them clamped), and the
+    expected absolute error of rgb as its logarithm f32[N,1,H,W]."""
+
+    rgb: Tensor
+    depth_code: Tensor
+    scores: Tensor
+    log_error: Tensor
+
+
+def one_hot(ids: Tensor) -> Tensor:
+    """u8[N,1,H,W] -> f32[N,19,H,W]; all zero where unknown."""
+    places = torch.arange(CLASSES, dtype=torch.uint8, device=ids.device).view(1, -1, 1, 1)
+    return (ids == places).float()
+
+
+def shares(ids: Tensor) -> Tensor:
+    """Share of each class among all 2x2 pixels of a cell, u8[N,1,H,W] -> f32[N,19,H/2,W/2]; unknown pixels count for none."""
+    return functional.avg_pool2d(one_hot(ids), 2)
+
+
+def joined(planes: list[Tensor], dtype: torch.dtype) -> Tensor:
+    """Planes [N,C,h,w] in one tensor of a type. The list is emptied: they are large, and nothing else needs them."""
+    whole = torch.cat([plane.to(dtype) for plane in planes], 1)
+    planes.clear()
+    return whole
+
+
+class CellNet(nn.Module):
+    """What refiner and finisher have in common: residual blocks on cells of 2x2 pixels, around others on cells of 4x4.
+
+    Args:
+        inside, outside: channels that go in and come out, per cell of 2x2 pixels.
+        widths: channels in the outer and the inner blocks; blocks: how many before and after, and within.
+        reach: side of the first convolution, cells.
+    """
+
+    def __init__(
+        self, inside: int, outside: int, widths: tuple[int, int], blocks: tuple[int, int], reach: int
+    ) -> None:
+        super().__init__()
+        fine, coarse = widths
+        self.enter = nn.Conv2d(inside, fine, reach, padding=reach // 2)
+        self.before = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
+        self.shrink = nn.Conv2d(fine, coarse, 2, stride=2)
+        self.middle = nn.ModuleList(DecoderBlock(coarse) for _ in range(blocks[1]))
+        self.grow = nn.Conv2d(coarse, 4 * fine, 1)
+        self.join = nn.Conv2d(2 * fine, fine, 1)
+        self.after = nn.ModuleList(DecoderBlock(fine) for _ in range(blocks[0]))
+        self.norm = ChannelNorm(fine)
+        self.leave = nn.Conv2d(fine, outside, 1)
+
+    def pixels(self, planes: Tensor, frames: int) -> Tensor:
+        """[N,inside,h,w] -> f32[N,outside/4,2h,2w]; `frames` neighbouring ones belong together."""
+        planes = planes.contiguous(memory_format=torch.channels_last)
+        x = self.enter(planes)
+        del planes  # they are large
+        for block in self.before:
+            x = block(x, frames)
+        y = self.shrink(x)
+        for block in self.middle:
+            y = block(y, frames)
+        y = functional.pixel_shuffle(self.grow(y), 2)
+        x = self.join(torch.cat([x, y], 1).contiguous(memory_format=torch.channels_last))
+        for block in self.after:
+            x = block(x, frames)
+        return functional.pixel_shuffle(self.leave(functional.silu(self.norm(x))).float(), 2)
+
+
+class Refiner(CellNet):
+    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there.
+
+    With `renders` it also reads what a fitted scene shows.
+    """
+
+    SIZES = (12, 4, 4, 4, 4, 4 * CLASSES, 4, 4, 4)
+    """Outputs: colour to add, gates of the condition's colour and backdrop, depth to add, gate of depth, scores to add,
+    gates of the condition's classes and the backdrop's, logarithm of the error."""
+    STARTS = (0.0, -1.0, -4.0, 0.0, -1.0, 0.0, 0.0, -4.0, -2.5)
+    """Their values before training."""
+    RENDER_SIZES, RENDER_STARTS = (4, 4, 4), (-4.0, -4.0, -4.0)
+    """Further outputs with `renders`: gates of its colour, depth and classes."""
+    RENDER_PLANES = 12 + 4 + 4 + 4 + CLASSES
+
+    def __init__(self, channels: int, widths: tuple[int, int], blocks: tuple[int, int], renders: bool = False) -> None:
+        sizes = self.SIZES + (self.RENDER_SIZES if renders else ())
+        inside = channels + 12 + 4 + 12 + 12 + 4 + 4 + 4 + 2 * CLASSES + (self.RENDER_PLANES if renders else 0)
+        super().__init__(inside, sum(sizes), widths, blocks, reach=3)
+        self.renders, self.sizes = renders, sizes
+        self.reset()
+
+    def take_back(self, class_weights: Tensor) -> None:
+        """Undo what class weights f32[19] in the loss did to the scores: each class loses the logarithm of its weight."""
+        first = sum(self.SIZES[:5])
+        with torch.no_grad():
+            bias = self.leave.bias[first : first + 4 * CLASSES]  # type: ignore[index]
+            bias -= class_weights.log().repeat_interleave(4).to(bias.device)
+
+    def reset(self) -> None:
+        """Output that adds nothing and copies little, whatever the other weights are."""
+        with torch.no_grad():
+            self.leave.weight.zero_()
+            starts = self.STARTS + (self.RENDER_STARTS if self.renders else ())
+            parts = [torch.full((size,), start) for size, start in zip(self.sizes, starts)]
+            self.leave.bias.copy_(torch.cat(parts))  # type: ignore[union-attr]
+
+    def forward(self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+        """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels."""
+        rgb, depth, scores = codec.decode_raw(latents)
+        fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
+        seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
+        planes = [*(latents[m] for m in MODALITIES), fold(rgb), fold(depth), *(fold(x) for x in seen), shares(given.ids),
+                  shares(given.backdrop_ids)]  # fmt: skip
+        if self.renders:
+            planes += [*(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)), shares(given.render_ids)]
+        out = self.pixels(joined(planes, rgb.dtype), frames)
+        parts = out.split([size // 4 for size in self.sizes], 1)
+        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[: len(self.SIZES)]
+        if self.renders:
+            take_render, take_code, take_render_ids = (gate.sigmoid() for gate in parts[len(self.SIZES) :])
+            rgb = rgb + take_render * (given.render - rgb)
+            depth = depth + take_code * given.alpha.clamp(min=0) * (given.render_code - depth)
+            scores = scores + COPY_SCORE * take_render_ids * one_hot(given.render_ids)
+        rgb = rgb + take.sigmoid() * (given.color - rgb)
+        rgb = rgb + take_far.sigmoid() * (given.backdrop - rgb) + 0.2 * more
+        depth = depth + take_depth.sigmoid() * (given.depth_code - depth) + 0.05 * deeper
+        scores = scores + more_scores + COPY_SCORE * (
+            take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids)
+        )  # fmt: skip
+        return Refined(rgb, depth, scores, log_error)
+
+
+@dataclass(frozen=True)
+class PixelTruth:
+    """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 = unlabelled);
+    depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap."""
+
+    rgb: Tensor
+    depth_code: Tensor
+    ids: Tensor
+    depth_known: Tensor
+
+    def crop(self, rows: slice, columns: slice) -> PixelTruth:
+        """A rectangle of pixels."""
+        return PixelTruth(*(x[..., rows, columns] for x in (self.rgb, self.depth_code, self.ids, self.depth_known)))

@@ -1,0 +1,462 @@
+"""The denoising network of the published model: a latent-video UNet with spatial and temporal transformers.
+
+Everything except the temporal layers works on frames, [B*T,C,h,w]. A frame sees the others in three places: in the four
+1-D convolutions over time inside each residual block, in the temporal transformers (self-attention over the T frames at one
+cell; order is known only through the convolutions and the image tokens), and in `first`, one more temporal transformer right
+after the input convolution. Cross-attention looks at the caption's tokens and, with keys and values of its own, at the 16
+image tokens that belong to the frame.
+
+The vector that modulates the residual blocks is time(t) + label(modality) + fps(rate), all through sinusoids.
+
+Source: paper of MuDG, section on the multi-modal diffusion model; architecture of DynamiCrafter (Xing et al.) with a modality label added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
+
+from mudg.base.errors import UsageError
+from mudg.diffusion.network import sinusoid
+from mudg.networks.clip import attend
+
+# resampler ------------------------------------------------------------------------------------------------------------
+#
+# The image-token resampler: from all tokens of the image tower to 16 tokens for each of 16 frames.
+#
+# Learned queries read from the image's tokens and from each other, layer by layer (Perceiver: Jaegle et al.; its use in video:
+# Alayrac et al., "Flamingo"). Queries belong to frames, so the number of frames is part of the weights.
+
+
+@dataclass(frozen=True)
+class ResamplerConfig:
+    """Sizes; the defaults are the published ones (48,787,456 parameters)."""
+
+    width: int = 1024
+    layers: int = 4
+    head_width: int = 64
+    heads: int = 12
+    tokens: int = 16
+    """Tokens per frame."""
+    frames: int = 16
+    image_width: int = 1280
+    context_width: int = 1024
+    feed_factor: int = 4
+
+
+class ReadingAttention(nn.Module):
+    """Attention of the queries over image tokens and queries together."""
+
+    def __init__(self, config: ResamplerConfig) -> None:
+        super().__init__()
+        inner = config.heads * config.head_width
+        self.heads = config.heads
+        self.norm_image, self.norm_queries = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
+        self.query = nn.Linear(config.width, inner, bias=False)
+        self.key_value = nn.Linear(config.width, 2 * inner, bias=False)
+        self.out = nn.Linear(inner, config.width, bias=False)
+
+    def forward(self, image: Tensor, queries: Tensor) -> Tensor:
+        """`image` [B,M,C], `queries` [B,N,C] -> [B,N,C]."""
+        image, queries = self.norm_image(image), self.norm_queries(queries)
+        key, value = self.key_value(torch.cat([image, queries], 1)).chunk(2, -1)
+        return self.out(attend(self.query(queries), key, value, self.heads))
+
+
+class ResamplerLayer(nn.Module):
+    """Attention and a feed-forward part, each around a residual."""
+
+    def __init__(self, config: ResamplerConfig) -> None:
+        super().__init__()
+        hidden = config.feed_factor * config.width
+        self.attention = ReadingAttention(config)
+        self.feed = nn.Sequential(
+            nn.LayerNorm(config.width), nn.Linear(config.width, hidden, bias=False), nn.GELU(),
+            nn.Linear(hidden, config.width, bias=False),
+        )  # fmt: skip
+
+    def forward(self, image: Tensor, queries: Tensor) -> Tensor:
+        queries = queries + self.attention(image, queries)
+        return queries + self.feed(queries)
+
+
+class Resampler(nn.Module):
+    """The resampler (see the module text)."""
+
+    def __init__(self, config: ResamplerConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.queries = nn.Parameter(torch.zeros(1, config.frames * config.tokens, config.width))
+        self.enter = nn.Linear(config.image_width, config.width)
+        self.layers = nn.ModuleList(ResamplerLayer(config) for _ in range(config.layers))
+        self.leave = nn.Linear(config.width, config.context_width)
+        self.norm = nn.LayerNorm(config.context_width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features of the image tower [B,257,image_width] -> image tokens [B,frames,tokens,context_width]."""
+        image = self.enter(features)
+        queries = self.queries.expand(len(features), -1, -1)
+        for layer in self.layers:
+            queries = layer(image, queries)
+        return self.norm(self.leave(queries)).unflatten(1, (self.config.frames, self.config.tokens))
+
+
+# video unet -----------------------------------------------------------------------------------------------------------
+
+
+GROUPS = 32
+
+
+@dataclass(frozen=True)
+class VideoUNetConfig:
+    """Sizes of the network; the defaults are the published ones (1,440,917,060 parameters)."""
+
+    channels_in: int = 12
+    channels_out: int = 4
+    width: int = 320
+    multipliers: tuple[int, ...] = (1, 2, 4, 4)
+    blocks: int = 2
+    """Residual blocks per level on the way down; one more on the way up."""
+    attention: tuple[bool, ...] = (True, True, True, False)
+    """Levels with transformers; the middle always has them."""
+    head_width: int = 64
+    first_heads: int = 8
+    context_width: int = 1024
+    dropout: float = 0.1
+
+    def __post_init__(self) -> None:
+        if len(self.multipliers) != len(self.attention):
+            raise UsageError("multipliers and attention need one entry per level",
+                got=f"{self.multipliers}, {self.attention}")  # fmt: skip
+        if self.width % GROUPS:
+            raise UsageError("the width is no multiple of the normalisation groups", expected=f"multiple of {GROUPS}",
+                got=str(self.width))  # fmt: skip
+
+
+class SeededDropout(nn.Module):
+    """Dropout that draws for each clip from a seed of its own; the caller sets `seeds`, one per clip, before a training step.
+
+    What is drawn depends on the layer's seeds alone: neither on the other clips of the batch nor on when the layer is run, so
+    that a second computation in the backward pass draws the same.
+    """
+
+    seeds: tuple[int, ...] = ()
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B*n,..] -> the same; the first axis holds the clips one after another."""
+        if not self.training or self.share == 0:
+            return x
+        if not self.seeds or len(x) % len(self.seeds):
+            raise UsageError("dropout needs a seed for every clip", where="SeededDropout",
+                expected=f"a divisor of {len(x)} seeds", got=str(len(self.seeds)),
+                remedy="call PublishedMDM.loss, or eval()")  # fmt: skip
+        shape = (len(x) // len(self.seeds), *x.shape[1:])
+        draws = [
+            torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
+        ]
+        return x * (torch.cat(draws) >= self.share).to(x) / (1 - self.share)
+
+
+class Context(NamedTuple):
+    """What cross-attention looks at: caption tokens [B,77,D] and image tokens [B*T,16,D]."""
+
+    text: Tensor
+    image: Tensor
+
+
+class ContextKeys(NamedTuple):
+    """Keys and values of a context in one layer: of caption tokens [B,77,C], of image tokens [B*T,16,C]."""
+
+    key: Tensor
+    value: Tensor
+    image_key: Tensor
+    image_value: Tensor
+
+
+class Attention(nn.Module):
+    """Multi-head attention; with `image`, a second attention over image tokens is added before the output projection."""
+
+    def __init__(self, width: int, context_width: int, heads: int, image: bool, dropout: float) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width, bias=False)
+        self.key = nn.Linear(context_width, width, bias=False)
+        self.value = nn.Linear(context_width, width, bias=False)
+        self.image_key = nn.Linear(context_width, width, bias=False) if image else None
+        self.image_value = nn.Linear(context_width, width, bias=False) if image else None
+        self.out = nn.Linear(width, width)
+        self.dropout = SeededDropout(dropout)
+
+    def forward(self, tokens: Tensor, context: Context | ContextKeys | None = None) -> Tensor:
+        """`tokens` [N,L,C]; `context` of the same clips, None for self-attention -> [N,L,C]."""
+        query = self.query(tokens)
+        if context is None:
+            return self.dropout(self.out(attend(query, self.key(tokens), self.value(tokens), self.heads)))
+        seen = self.keys(context) if isinstance(context, Context) else context
+        repeats = len(tokens) // len(seen.key)
+        key, value = (x.repeat_interleave(repeats, 0) for x in (seen.key, seen.value))
+        mixed = attend(query, key, value, self.heads) + attend(query, seen.image_key, seen.image_value, self.heads)
+        return self.dropout(self.out(mixed))
+
+    def keys(self, context: Context) -> ContextKeys:
+        """Keys and values of a context; of layers that have those of an image."""
+        text, image = context
+        return ContextKeys(self.key(text), self.value(text), self.image_key(image), self.image_value(image))  # type: ignore[misc]
+
+
+class GatedFeedForward(nn.Module):
+    """Linear - a * GELU(b) - Linear, hidden width four times the outer one (Shazeer, "GLU variants")."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.enter = nn.Linear(width, 8 * width)
+        self.dropout = SeededDropout(dropout)
+        self.out = nn.Linear(4 * width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[N,L,C] -> the same."""
+        value, gate = self.enter(x).chunk(2, -1)
+        return self.out(self.dropout(value * functional.gelu(gate)))
+
+
+class TransformerBlock(nn.Module):
+    """Attention, attention, feed-forward, each after a layer norm and around a residual."""
+
+    def __init__(self, width: int, heads: int, context_width: int | None, dropout: float) -> None:
+        super().__init__()
+        self.norm1, self.norm2, self.norm3 = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attention1 = Attention(width, width, heads, False, dropout)
+        self.attention2 = Attention(width, context_width or width, heads, context_width is not None, dropout)
+        self.feed = GatedFeedForward(width, dropout)
+
+    def forward(self, x: Tensor, context: Context | ContextKeys | None = None) -> Tensor:
+        """`x` [N,L,C] -> the same."""
+        x = x + self.attention1(self.norm1(x))
+        x = x + self.attention2(self.norm2(x), context)
+        return x + self.feed(self.norm3(x))
+
+
+def _zero(layer: nn.Module) -> nn.Module:
+    for value in layer.parameters():
+        nn.init.zeros_(value)
+    return layer
+
+
+class SpatialTransformer(nn.Module):
+    """Self-attention over the cells of a frame and cross-attention to caption and image tokens."""
+
+    def __init__(self, width: int, config: VideoUNetConfig) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, width, eps=1e-6)
+        self.enter = nn.Linear(width, width)
+        self.block = TransformerBlock(width, width // config.head_width, config.context_width, config.dropout)
+        self.out = _zero(nn.Linear(width, width))
+
+    def forward(self, x: Tensor, context: Context | ContextKeys) -> Tensor:
+        """`x` [B*T,C,h,w] -> the same."""
+        tokens = self.enter(self.norm(x).flatten(2).transpose(1, 2))
+        tokens = self.out(self.block(tokens, context))
+        return x + tokens.transpose(1, 2).unflatten(2, x.shape[2:])
+
+
+class TemporalTransformer(nn.Module):
+    """Two self-attentions over the frames of a clip, at every cell for itself."""
+
+    def __init__(self, width: int, inner: int, heads: int, dropout: float, convolution: bool = False) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, width, eps=1e-6)
+        self.enter = nn.Conv1d(width, inner, 1) if convolution else nn.Linear(width, inner)
+        self.block = TransformerBlock(inner, heads, None, dropout)
+        self.out = _zero(nn.Conv1d(inner, width, 1) if convolution else nn.Linear(inner, width))
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same. Normalised over all frames of a clip together."""
+        n, c, h, w = x.shape
+        video = x.unflatten(0, (n // frames, frames)).transpose(1, 2)
+        tokens = self.norm(video).permute(0, 3, 4, 2, 1).reshape(-1, frames, c)
+        tokens = functional.linear(tokens, self.enter.weight.flatten(1), self.enter.bias)
+        tokens = self.block(tokens)
+        tokens = functional.linear(tokens, self.out.weight.flatten(1), self.out.bias)  # type: ignore[arg-type, operator, union-attr]
+        return x + tokens.reshape(n // frames, h, w, frames, c).permute(0, 3, 4, 1, 2).reshape(n, c, h, w)
+
+
+class TemporalConv(nn.Module):
+    """norm - SiLU - convolution over three neighbouring frames."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(GROUPS, width)
+        self.dropout = SeededDropout(dropout)
+        self.conv = nn.Conv3d(width, width, (3, 1, 1), padding=(1, 0, 0))
+
+    def forward(self, video: Tensor) -> Tensor:
+        """[B,C,T,h,w] -> the same."""
+        return self.conv(self.dropout(functional.silu(self.norm(video))))
+
+
+class ResBlock(nn.Module):
+    """norm - SiLU - conv, the embedding added, norm - SiLU - conv, around a residual; then four temporal convolutions around another."""
+
+    def __init__(self, inside: int, outside: int, embed: int, dropout: float) -> None:
+        super().__init__()
+        self.norm1 = nn.GroupNorm(GROUPS, inside)
+        self.conv1 = nn.Conv2d(inside, outside, 3, padding=1)
+        self.embed = nn.Linear(embed, outside)
+        self.norm2 = nn.GroupNorm(GROUPS, outside)
+        self.dropout = SeededDropout(dropout)
+        self.conv2 = _zero(nn.Conv2d(outside, outside, 3, padding=1))
+        self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
+        self.temporal = nn.ModuleList(TemporalConv(outside, dropout if n else 0.0) for n in range(4))
+        _zero(self.temporal[-1].conv)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
+        h = self.conv1(functional.silu(self.norm1(x)))
+        h = h + self.embed(functional.silu(embedding))[:, :, None, None]
+        h = self.conv2(self.dropout(functional.silu(self.norm2(h))))
+        h = self.skip(x) + h
+        video = h.unflatten(0, (-1, frames)).transpose(1, 2)
+        for conv in self.temporal:
+            video = conv(video)
+        return h + video.transpose(1, 2).flatten(0, 1)
+
+
+class Stage(nn.Module):
+    """One step down or up the U: a plain convolution (`conv`), or a residual block with its transformers, and what enlarges after it."""
+
+    def __init__(
+        self, inside: int, outside: int, config: VideoUNetConfig, *, conv_stride: int = 0, attention: bool = False,
+        grow: bool = False,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.conv = nn.Conv2d(inside, outside, 3, stride=conv_stride, padding=1) if conv_stride else None
+        self.res = None if conv_stride else ResBlock(inside, outside, 4 * config.width, config.dropout)
+        self.spatial = SpatialTransformer(outside, config) if attention else None
+        heads = outside // config.head_width
+        self.temporal = TemporalTransformer(outside, outside, heads, config.dropout) if attention else None
+        self.grow = nn.Conv2d(outside, outside, 3, padding=1) if grow else None
+
+    def forward(self, x: Tensor, embedding: Tensor, context: Context | ContextKeys, frames: int) -> Tensor:
+        """`x` [B*T,inside,h,w] -> [B*T,outside,h',w']."""
+        if self.conv is not None:
+            return self.conv(x)
+        if self.res is not None:
+            x = self.res(x, embedding, frames)
+        if self.spatial is not None and self.temporal is not None:
+            x = self.temporal(self.spatial(x, context), frames)
+        if self.grow is not None:
+            x = self.grow(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        return x
+
+
+class Middle(nn.Module):
+    """The bottom of the U: residual block, both transformers, residual block."""
+
+    def __init__(self, width: int, config: VideoUNetConfig) -> None:
+        super().__init__()
+        self.res1 = ResBlock(width, width, 4 * config.width, config.dropout)
+        self.spatial = SpatialTransformer(width, config)
+        self.temporal = TemporalTransformer(width, width, width // config.head_width, config.dropout)
+        self.res2 = ResBlock(width, width, 4 * config.width, config.dropout)
+
+    def forward(self, x: Tensor, embedding: Tensor, context: Context | ContextKeys, frames: int) -> Tensor:
+        """[B*T,C,h,w] -> the same."""
+        x = self.temporal(self.spatial(self.res1(x, embedding, frames), context), frames)
+        return self.res2(x, embedding, frames)
+
+
+def _embedding(width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(width, 4 * width), nn.SiLU(), nn.Linear(4 * width, 4 * width))
+
+
+class VideoUNet(nn.Module):
+    """The network (see the module text)."""
+
+    def __init__(self, config: VideoUNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.checkpointing = False
+        """Training: keep only what passes between stages, and compute the rest again in the backward pass."""
+        width, top = config.width, len(config.multipliers) - 1
+        self.time, self.label, self.fps = _embedding(width), _embedding(width), _embedding(width)
+        _zero(self.fps[2])
+        inner = config.first_heads * config.head_width
+        self.first = TemporalTransformer(width, inner, config.first_heads, config.dropout, convolution=True)
+        self.down = nn.ModuleList([Stage(config.channels_in, width, config, conv_stride=1)])
+        skips, inside = [width], width
+        for level, multiplier in enumerate(config.multipliers):
+            for _ in range(config.blocks):
+                self.down.append(Stage(inside, multiplier * width, config, attention=config.attention[level]))
+                inside = multiplier * width
+                skips.append(inside)
+            if level < top:
+                self.down.append(Stage(inside, inside, config, conv_stride=2))
+                skips.append(inside)
+        self.middle = Middle(inside, config)
+        self.up = nn.ModuleList()
+        for level in reversed(range(top + 1)):
+            outside = config.multipliers[level] * width
+            for number in range(config.blocks + 1):
+                grow = level > 0 and number == config.blocks
+                self.up.append(
+                    Stage(inside + skips.pop(), outside, config, attention=config.attention[level], grow=grow)
+                )
+                inside = outside
+        self.norm = nn.GroupNorm(GROUPS, inside)
+        self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
+
+    def context_keys(self, text: Tensor, image: Tensor) -> list[ContextKeys]:
+        """Keys and values of caption tokens [B,77,D] and image tokens [B,T,16,D] in every layer that looks at them, in the order of
+        `forward`. They are the same at every noise step."""
+        spatial = [stage.spatial for stage in (*self.down, self.middle, *self.up) if stage.spatial is not None]
+        context = Context(text, image.flatten(0, 1))
+        return [layer.block.attention2.keys(context) for layer in spatial]  # type: ignore[union-attr, operator]
+
+    def forward(
+        self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor, keys: Sequence[ContextKeys] | None = None
+    ) -> Tensor:
+        """One denoiser pass.
+
+        Args:
+            x: [B,T,channels_in,h,w], noisy latent, latent of the colour condition, latent of the depth condition.
+            t: i64[B] noise step. label: i64[B] modality. fps: i64[B] frames per second.
+            text: [B,77,D] caption tokens. image: [B,T,16,D] image tokens of each frame.
+            keys: `context_keys` of text and image, where they are computed already.
+
+        Returns:
+            Velocity [B,T,channels_out,h,w].
+        """
+        batch, frames = x.shape[:2]
+        wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
+        embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
+        embedding = embedding.repeat_interleave(frames, 0)
+        context = Context(text, image.flatten(0, 1))
+        ready = iter(keys or ())
+        seen = lambda stage: context if keys is None or stage.spatial is None else next(ready)  # noqa: E731
+        h = x.flatten(0, 1)
+        skips = []
+        for number, stage in enumerate(self.down):
+            h = self._run(stage, h, embedding, seen(stage), frames)
+            if number == 0:
+                h = self.first(h, frames)
+            skips.append(h)
+        h = self._run(self.middle, h, embedding, seen(self.middle), frames)
+        for stage in self.up:
+            h = self._run(stage, torch.cat([h, skips.pop()], 1), embedding, seen(stage), frames)
+        return self.leave(functional.silu(self.norm(h))).unflatten(0, (batch, frames))
+
+    def _run(self, stage: nn.Module, *inputs: Tensor | Context | ContextKeys | int) -> Tensor:
+        """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
+        if not (self.checkpointing and self.training and torch.is_grad_enabled()):
+            return stage(*inputs)
+        return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)  # type: ignore[return-value]

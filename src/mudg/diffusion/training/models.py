@@ -1,0 +1,294 @@
+"""The models that `learn` can train, what is particular to each, and with which weights a training starts.
+
+The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part, settings)`,
+also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a later stage may freeze.
+All else is a row of `KINDS`. A new kind of model is a class with these methods and a row here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mudg.base import log, palette, seeds
+from mudg.base.errors import ResourceError, UsageError
+from mudg.base.run_folder import RunDir
+from mudg.base.types import Clip
+from mudg.core import losses
+from mudg.diffusion import files as mdm_files
+from mudg.diffusion.clips.shards import ShardSource
+from mudg.diffusion.extended import extended, same_denoiser
+from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.published.model import PublishedMDM, is_published
+from mudg.diffusion.settings.learn import LearnConfig
+from mudg.diffusion.training import published as learn_published
+from mudg.diffusion.training import score as learn_score
+from mudg.diffusion.training.clips import draw_clips
+from mudg.diffusion.training.parallel import Ranks, agreed_terms
+from mudg.diffusion.training.state import TrainingState, mean_of, newest_checkpoint, read_rows
+from mudg.networks.codec import Modality, PatchCodec
+
+Model = MDM | PublishedMDM
+PATCH = 2
+"""Side of the squares of latent pixels that the network processes as one cell."""
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """How one class of models is saved, described and rebuilt.
+
+    save    (model, folder, card, facts)
+    card    (model, settings, scores, sentence on the training data) -> text of the model card
+    rebuilt (model, weights of its trained part) -> a model with these, ready for use
+    """
+
+    save: Callable[[Any, Path, str, Mapping[str, Any]], None]
+    card: Callable[[Any, LearnConfig, Mapping[str, Any], str], str]
+    rebuilt: Callable[[Any, Mapping[str, Tensor]], Any]
+
+
+def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
+    """A copy of a model where it was trained, ready for use, whose trained part has these weights."""
+    made = MDM(model.config)
+    frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
+    made.load_state_dict({**frozen, **weights})
+    return made.to(model.device).eval()
+
+
+KINDS: dict[type[nn.Module], ModelKind] = {
+    MDM: ModelKind(mdm_files.save, learn_score.model_card, mdm_rebuilt),
+    PublishedMDM: ModelKind(learn_published.save, learn_published.card, learn_published.rebuilt),
+}
+
+
+def kind_of(model: nn.Module) -> ModelKind:
+    """The row of a model; UsageError if it cannot be trained."""
+    if type(model) not in KINDS:
+        raise UsageError("this kind of model cannot be trained here", got=type(model).__name__,
+            expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
+    return KINDS[type(model)]
+
+
+# start ----------------------------------------------------------------------------------------------------------------
+
+
+def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
+    """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
+
+    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
+    ask for them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
+    size and length than before. Inputs for renders and a finisher are learned from generated cities with renders; from other clips
+    no model gets any that it does not have.
+
+    Raises:
+        UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
+    """
+    wanted = model_config(config)
+    can_grow = config.data.renders and not config.data.scenes
+    if not config.start:
+        return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
+    if is_published(config.start):
+        if not _network_is_default(config):
+            raise UsageError("the shape of a published-type network cannot be changed", where="--start",
+                             remedy="leave out the settings of the group network")  # fmt: skip
+        return learn_published.starting_model(config), set()
+    before = mdm_files.load(config.start)
+    if before.config.window != config.data.window:
+        log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
+    wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
+    resized = model_of_window(before, wanted.window, wanted.area_px)
+    if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
+        log.info("learn: the network has the shape of --start")
+        wanted = resized.config
+    if wanted == resized.config:
+        return resized, set()
+    grown = {name for name, had in (("refiner", before.refiner), ("finisher", before.finisher)) if had is None}
+    return extended(resized, wanted), grown
+
+
+def model_of_window(model: MDM, window: int, area_px: int = 0) -> MDM:
+    """The same model, made for clips of `window` frames (and of `area_px` pixels)."""
+    made = MDM(replace(model.config, window=window, area_px=area_px or model.config.area_px))
+    made.load_state_dict(model.state_dict())
+    return made.eval()
+
+
+def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
+    """A network that uses renders, and has a finisher, as `before` does (None: neither)."""
+    if before is None:
+        return replace(wanted, renders=False, finish_widths=(), finish_blocks=())
+    return replace(wanted, renders=before.renders, finish_widths=before.finish_widths, finish_blocks=before.finish_blocks)
+
+
+def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
+    """Let the finisher keep its weights if the clips have no patches at a higher resolution to learn it from.
+
+    Raises:
+        UsageError: it has no weights yet.
+    """
+    if patches or not isinstance(model, MDM) or model.finisher is None:
+        return
+    if "finisher" in fresh:
+        raise UsageError(
+            "the training clips have no patches at a higher resolution, from which the finisher is learned",
+            where="--data.clips", remedy="choose another folder, or give --data.no-renders",
+        )  # fmt: skip
+    model.finisher.requires_grad_(False)
+    log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
+
+
+def _network_is_default(config: LearnConfig) -> bool:
+    """Whether the settings leave the network as it is by default."""
+    default = LearnConfig(data=config.data)
+    return model_config(config) == model_config(default)
+
+
+def model_config(config: LearnConfig) -> MDMConfig:
+    """The network that a learn configuration asks for."""
+    shape = asdict(config.network)
+    shape["refine_blocks"] = shape["refine_blocks"] if shape["refine_widths"] else ()
+    if not (shape["finish_widths"] and shape["refine_widths"] and shape["renders"]):
+        shape["finish_widths"] = shape["finish_blocks"] = ()
+    return MDMConfig(**shape, patch=PATCH, window=config.data.window, area_px=config.data.width * config.data.height)
+
+
+def freeze(model: Model, what: str) -> int:
+    """Let a part of the network keep its weights (see `LearnConfig.frozen`); returns the number of parameters it has.
+
+    Raises:
+        UsageError: nothing would be frozen: the network has no such layers.
+    """
+    if what == "nothing":
+        return 0
+    if what == "denoiser":
+        names = {name for name, _ in model.trained_part().named_parameters() if name.startswith("net.")}
+        if not isinstance(model, MDM) or model.refiner is None:
+            raise UsageError("without a refiner nothing is left to train", where="--frozen", got=what)
+    else:
+        names = model.temporal_parameters("all" if what == "temporal_layers" else "transformers")
+    count = 0
+    for name, parameter in model.trained_part().named_parameters():
+        if name in names:
+            parameter.requires_grad_(False)
+            count += parameter.numel()
+    if not count:
+        raise UsageError(
+            "there is nothing to freeze", where="--frozen", got=what, expected="a network with such layers"
+        )
+    log.info(f"learn: {what.replace('_', ' ')} are frozen ({count:,} parameters)")
+    return count
+
+
+def draw_weights(net: nn.Module, seed: int, purpose: str) -> None:
+    """Draw all weights that are not zero at the start from the run's seed (the constructor's own draw is not used)."""
+    generator = seeds.torch_generator(seed, 0, purpose)
+    with torch.no_grad():
+        for name, value in net.named_parameters():
+            if value.ndim >= 2 and bool(value.any()):
+                fan_in = math.prod(value.shape[1:])
+                gain = 2.0 if "conv1" in name else 1.0
+                value.copy_(torch.randn(value.shape, generator=generator) * math.sqrt(gain / fan_in))
+            elif value.ndim == 1 and name.endswith("bias"):
+                value.zero_()
+
+
+# training of the small model's latent codec, before the network: by the leader alone, on whole images -----------------
+
+
+CPU = torch.device("cpu")
+LEARNING_RATE = 2e-3
+FIT_IMAGES = 8
+
+
+def train_codec(
+    codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, device: torch.device = CPU
+) -> None:
+    """Fit the linear parts on the first cities of `folder`, on the CPU, then train the decoder on noisy latents, on a device."""
+    steps, out, alone = config.codec.steps, run_dir.path / "codec", Ranks(0, 1, device)
+    codec.to(device)
+    optimizer = torch.optim.AdamW(codec.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99), weight_decay=1e-3)
+    state = TrainingState(nn.ModuleDict({"codec": codec}), optimizer, None)
+    if not state.resume(out, alone):
+        codec.load_state_dict(_fitted(codec, config, folder).state_dict())
+    recent: list[dict[str, float]] = []
+    with log.task("codec", steps, state.step) as bar:
+        for step in range(state.step, steps):
+            warm, left = min(1.0, (step + 1) / 50), 1 - step / steps
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * warm * min(1.0, left / 0.6)
+            clips = [clip.to(device) for clip in draw_clips(config, folder, step, config.codec.batch, 1, "codec batch")]
+            with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+                loss, terms = codec_loss(codec, clips, seeds.torch_generator(config.seed, step, "codec noise"))
+            terms, _ = agreed_terms(alone, terms, 1, step, "codec")
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
+            optimizer.step()
+            recent.append(terms)
+            bar.update(" ".join(f"{k} {v:.4f}" for k, v in mean_of(recent[-20:]).items()))
+            bar.advance()
+            state.step = done = step + 1
+            if done % 50 == 0 or done == steps:
+                run_dir.log(codec_step=done, **mean_of(recent))
+                recent = []
+            if done % 200 == 0 or done == steps:
+                state.save(out, alone, {})
+
+
+def _fitted(like: PatchCodec, config: LearnConfig, folder: Path | ShardSource) -> PatchCodec:
+    """A codec on the CPU with weights drawn and its linear parts fitted."""
+    codec = PatchCodec(like.config)
+    draw_weights(codec, config.seed, "codec weights")
+    batches = [draw_clips(config, folder, n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
+    images = [clip for batch in batches for clip in batch]
+    height, width = (min(clip.rgb.shape[axis] for clip in images) for axis in (-2, -1))  # steps may differ in size
+    codec.fit_color(torch.cat([clip.rgb[..., :height, :width] for clip in images]))
+    codec.fit_depth(torch.cat([clip.depth[..., :height, :width] for clip in images]))
+    return codec
+
+
+def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
+    """The codec that the leader trained, in every process."""
+    saved = newest_checkpoint(out / "codec", ranks)
+    if saved is None:
+        raise ResourceError("the trained codec that rank 0 wrote is not visible here", where=str(out / "codec"),
+                            remedy="choose an --out on a file system that all processes share")  # fmt: skip
+    read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
+
+
+def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    """Reconstruction loss of the decoder on latents with a little noise, drawn on the CPU; modalities are left out at random.
+
+    L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes.
+    """
+    rgb, depth, known, ids = (
+        torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
+    )
+    with torch.no_grad():
+        latents: dict[Modality, Tensor] = {
+            "rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)
+        }  # fmt: skip
+        amount = 0.15 * torch.rand(len(rgb), 1, 1, 1, generator=generator).to(rgb.device)
+        keep = (torch.rand(3, len(rgb), 1, 1, 1, generator=generator) > 0.15).float().to(rgb.device)
+        noisy: dict[Modality, Tensor] = {
+            m: (z + amount * torch.randn(z.shape, generator=generator).to(z.device)) * k for (m, z), k in zip(latents.items(), keep)
+        }
+        target = codec.linear_depth_code(depth)
+    made_rgb, made_depth, scores = codec.decode_raw(noisy)
+    ids = torch.where(keep[2, :, 0] > 0, ids, palette.UNLABELLED)
+    labelled = bool((ids < palette.UNLABELLED).any())
+    parts = {
+        "rgb": losses.image_error((made_rgb - (rgb * 2 - 1)) * keep[0], square=0.5, gradient=0.25),
+        "depth": ((made_depth - target) * keep[1] * known).abs().mean(),
+        "semantics": functional.cross_entropy(scores, ids, ignore_index=palette.UNLABELLED)
+        if labelled
+        else scores.sum() * 0,
+    }
+    loss = parts["rgb"] + parts["depth"] + 0.1 * parts["semantics"]
+    return loss, {name: float(part.detach()) for name, part in parts.items()}

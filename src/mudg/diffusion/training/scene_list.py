@@ -1,0 +1,350 @@
+"""Training on a list of thousands of scenes: what the list says, which clip is drawn, and scenes that cannot be used.
+
+A list is a file in YAML or JSON,
+
+    data_sets: {nuscenes: 3.0, kitti: 1.0}              shares of the clips (left out: by the number of scenes)
+    scenes:
+      - s3://bucket/clips/0001                          a folder of clips, or
+      - {path: runs/0002, data_set: kitti, weight: 2, held_out: true}
+
+or plain text: a scene in each line, `PATH`, or `PATH<tab>DATA_SET<tab>WEIGHT`. Nothing of a scene is read before it is drawn.
+"""
+
+from __future__ import annotations
+
+import collections
+import hashlib
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Final
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from mudg.base import log, plain_yaml, seeds, store
+from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.location import Location
+from mudg.base.records import StrictRecord, parse_record, understood
+from mudg.diffusion.clips import from_log
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.from_city import HELD_OUT
+from mudg.diffusion.clips.from_log import LogClipRules, LogSource
+from mudg.diffusion.clips.shards import Result
+from mudg.diffusion.clips.sources import FolderOfShards, ShardCache, read_present
+from mudg.scene.read import read_scene
+
+SUFFIXES: Final = (".yaml", ".yml", ".json", ".txt")
+LARGEST_LIST: Final = 4_000_000
+"""Bytes of a list in YAML; one in JSON, or of plain lines, may be larger."""
+SPAN: Final = 100_000_000
+"""Shard k of the list's n-th scene has the number n * SPAN + k + 1."""
+_OPEN: Final = 512
+"""Scenes whose facts are kept in memory."""
+
+
+class ListedScene(StrictRecord):
+    """One scene of a list."""
+
+    path: str = Field(min_length=1)
+    """A folder of clips, the output of `mudg run`, or SCENE=FUSED; on this machine or at an address."""
+    data_set: str = "scenes"
+    weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    """How often it is drawn, compared with others of its data set."""
+    held_out: bool = False
+    """Whether it is for scoring only."""
+
+
+def _as_record(value: object) -> object:
+    return {"path": value} if isinstance(value, str) else value
+
+
+class _Listed(StrictRecord):
+    data_sets: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = {}
+    scenes: list[Annotated[ListedScene, BeforeValidator(_as_record)]] = Field(min_length=1)
+
+
+class SceneList:
+    """The scenes of a list and how they are drawn.
+
+    Args:
+        scenes: in the list's order, which numbers them.
+        weights: of data sets; each left out counts as its scenes' weights together.
+        held_out: if no scene is marked for scoring, so many are set apart, chosen by their paths alone.
+    """
+
+    def __init__(self, scenes: Sequence[ListedScene], weights: dict[str, float], held_out: int, where: str) -> None:
+        self.scenes, self.where = scenes, where
+        self.scored = [n for n, scene in enumerate(scenes) if scene.held_out]
+        if not self.scored and held_out:
+            by_name = sorted(range(len(scenes)), key=lambda n: seeds.key(0, 0, f"held out {scenes[n].path}"))
+            self.scored = sorted(by_name[: min(held_out, len(scenes) - 1)])
+        kept = set(self.scored)
+        self.members: dict[str, list[int]] = {}
+        for n, scene in enumerate(scenes):
+            if n not in kept and scene.weight > 0:
+                self.members.setdefault(scene.data_set, []).append(n)
+        unknown = sorted(set(weights) - {scene.data_set for scene in scenes})
+        if unknown:
+            raise InputError("a weight is given for a data set without scenes", where=where, got=", ".join(unknown[:8]),
+                             expected=f"one of {', '.join(list(self.members)[:20])}")  # fmt: skip
+        self._sums = {name: np.cumsum([scenes[n].weight for n in of]) for name, of in self.members.items()}
+        shares = np.array([weights.get(name, float(self._sums[name][-1])) for name in self.members], np.float64)
+        if not len(shares) or shares.sum() <= 0:
+            raise InputError("no scene of the list is left to train on", where=where, remedy="give positive weights")
+        self.shares = dict(zip(self.members, (shares / shares.sum()).tolist(), strict=True))
+        self._cuts = np.cumsum(shares / shares.sum())
+
+    def draw(self, rng: np.random.Generator) -> int:
+        """The number of a scene: a data set by its share, then a scene of it by its weight."""
+        chosen = min(int(np.searchsorted(self._cuts, rng.random(), side="right")), len(self._cuts) - 1)
+        name = list(self.members)[chosen]
+        sums = self._sums[name]
+        place = min(int(np.searchsorted(sums, rng.random() * sums[-1], side="right")), len(sums) - 1)
+        return self.members[name][place]
+
+    def summary(self) -> str:
+        """Data sets with their scenes and shares, a line each."""
+        lines = [f"{len(self.scenes)} scenes, {len(self.scored)} of them held out"]
+        lines += [f"  {name}: {len(of)} scenes, {100 * self.shares[name]:.3g} % of the clips" for name, of in self.members.items()]
+        return "\n".join(lines)
+
+
+def is_list(scenes: Sequence[str]) -> bool:
+    """Whether the setting `scenes` names a list."""
+    return len(scenes) == 1 and PurePosixPath(scenes[0]).suffix.lower() in SUFFIXES
+
+
+def read_list(text: str, held_out: int = 0) -> SceneList:
+    """Read a list. Relative paths are relative to the working directory.
+
+    Raises:
+        InputError: it is not there, or no list; names the record and the field.
+    """
+    suffix = PurePosixPath(text).suffix.lower()
+    content = Location.of(text).load()
+    if suffix == ".txt":
+        return SceneList(_plain_lines(content, text), {}, held_out, text)
+    value = store.parse_json(content, text) if suffix == ".json" else plain_yaml.parse_yaml(content, text, LARGEST_LIST)
+    listed = parse_record(_Listed, {"scenes": value} if isinstance(value, list) else value, f"{text}: ")
+    return SceneList(listed.scenes, listed.data_sets, held_out, text)
+
+
+def _plain_lines(content: bytes, where: str) -> list[ListedScene]:
+    try:
+        lines = content.decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError("a list is no text", where=where, expected="UTF-8", got=str(error)) from error
+    found = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        path, *rest = line.strip().split("\t")
+        try:
+            weight = float(rest[1]) if len(rest) > 1 else 1.0
+        except ValueError:
+            weight = -1.0
+        if len(rest) > 2 or not 0 <= weight < float("inf"):
+            raise InputError("not a line of a list of scenes", where=f"{where}, line {number}", got=line[:200],
+                             expected="PATH, or PATH<tab>DATA_SET<tab>WEIGHT")  # fmt: skip
+        found.append(ListedScene(path=path, data_set=rest[0] if rest else "scenes", weight=weight))
+    if not found:
+        raise InputError("a list names no scene", where=where)
+    return found
+
+
+# shards of listed scenes ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _OpenScene:
+    """What is known of a scene once it was drawn: the numbers of its shards, and how each is found."""
+
+    shards: tuple[int, ...]
+    find: Callable[[int], Path]
+
+
+class ListedShards:
+    """Clips of the scenes of a list, fetched or made when they are drawn.
+
+    Scenes and shards that are missing or damaged are named once and left out; others are drawn in their place.
+
+    Args:
+        rules: how clips are cut from scenes that are logs.
+        limit: share of the scenes that may be left out.
+    """
+
+    def __init__(self, scenes: SceneList, cache: ShardCache, rules: LogClipRules, limit: float) -> None:
+        self.scenes, self._cache, self._limit = scenes, cache, limit
+        self._rules = replace(rules, held_out_every=0)
+        self._open: collections.OrderedDict[int, _OpenScene] = collections.OrderedDict()
+        self.bad: dict[int, str] = {}
+        """What is left out, and why, by number of the shard; n * SPAN is the whole n-th scene."""
+        self._lock = threading.Lock()
+
+    def draw(self, rng: np.random.Generator, take: Callable[[int], Result]) -> Result:
+        """What `take` makes of a shard drawn with `rng`: a function of `rng` and of what the scenes hold.
+
+        Raises:
+            InputError: too many scenes are missing or damaged.
+        """
+        while True:
+            scene, place = self.scenes.draw(rng), rng.random()
+            number = scene * SPAN
+            if number in self.bad:
+                continue
+            try:
+                shards = self.opened(scene).shards
+                chosen = shards[min(int(place * len(shards)), len(shards) - 1)]
+            except (InputError, IntegrityError) as error:
+                self._leave_out(number, error)
+                continue
+            number += chosen + 1
+            if number in self.bad:
+                continue
+            try:
+                return take(number)
+            except (InputError, IntegrityError) as error:
+                self._leave_out(number, error)
+
+    def _leave_out(self, number: int, error: InputError | IntegrityError) -> None:
+        """A scene that cannot be opened, or one of its shards. Others of a scene are drawn on: what is left out must not depend on
+        what this process happened to read before."""
+        scenes = self.scenes.scenes
+        with self._lock:
+            if number not in self.bad:
+                self.bad[number] = str(error)
+                what = "a scene is" if number % SPAN == 0 else "clips of a scene are"
+                log.warn(f"learn: {what} left out: {scenes[number // SPAN].path}", *str(error).splitlines())
+            count = len({bad // SPAN for bad in self.bad})
+        most = int(self._limit * len(scenes))
+        if count > most or count == len(scenes):
+            raise UsageError("too many scenes of the list are missing or damaged", where=f"{self.scenes.where}, --data.bad-scenes",
+                expected=f"at most {most} of {len(scenes)}", got=f"{count}, the last: {str(error).splitlines()[0]}",
+                remedy="repair the scenes named above or take them off the list") from error  # fmt: skip
+
+    def scored(self) -> list[int]:
+        """The first shard of every held-out scene, or of one trained on where none is. Those that cannot be used are left out.
+
+        Raises:
+            InputError: none can be used.
+        """
+        found = []
+        for scene in self.scenes.scored or [next(iter(self.scenes.members.values()))[0]]:
+            try:
+                number = scene * SPAN + self.opened(scene).shards[0] + 1
+                self.clips_in(number)
+                found.append(number)
+            except (InputError, IntegrityError) as error:
+                self._leave_out(scene * SPAN, error)
+        if not found:
+            raise InputError("no held-out scene of the list can be used", where=self.scenes.where)
+        return found
+
+    def clips_in(self, number: int) -> int:
+        """Clips in a shard."""
+        return self.reading(number, clip_shards.clips_at)
+
+    def reading(self, number: int, read: Callable[[Path], Result]) -> Result:
+        """What `read` makes of a shard's file."""
+        return read_present(lambda: self.path(number), read)
+
+    def path(self, number: int) -> Path:
+        """The shard, on this machine."""
+        scene, shard = divmod(number, SPAN)
+        return self.opened(scene).find(shard - 1)
+
+    def opened(self, scene: int) -> _OpenScene:
+        """The facts of a scene. Those of the scenes used longest ago are forgotten.
+
+        Raises:
+            InputError, IntegrityError: it is missing or damaged, or there is no clip in it.
+        """
+        with self._lock:
+            found = self._open.get(scene)
+            if found is not None:
+                self._open.move_to_end(scene)
+                return found
+        found = self._look(self.scenes.scenes[scene].path, scene in self.scenes.scored)
+        if not found.shards or found.shards[-1] >= SPAN - 1:
+            raise InputError("no training clips in a scene", where=self.scenes.scenes[scene].path)
+        with self._lock:
+            self._open[scene] = found
+            while len(self._open) > _OPEN:
+                self._open.popitem(last=False)
+        return found
+
+    def _look(self, text: str, scored: bool) -> _OpenScene:
+        given, separator, fused = text.partition("=")
+        if not separator:
+            place = Location.of(text)
+            folder = FolderOfShards.open(place) if place.local is None else FolderOfShards(place, {})
+            numbers = folder.numbers()
+            if numbers:
+                chosen = tuple(n for n in numbers if n < HELD_OUT) or numbers
+                if place.local is not None:
+                    return _OpenScene(chosen, lambda n: clip_shards.shard_path(Path(place.text), n))
+                return _OpenScene(chosen, lambda n: self._cache.get(f"{folder.key}/{n:07d}.safetensors", lambda at: folder.bring(n, at)))
+        places = [Location.of(given), Location.of(fused)] if separator else [Location.of(given)]
+        if all(place.local is not None for place in places):
+            return self._of_log(from_log.log_source(text), scored, lambda make: make(from_log.log_source(text)))
+        return self._of_remote_log(places, scored)
+
+    def _of_log(
+        self, source: LogSource | None, scored: bool, with_log: Callable[[Callable[[LogSource], None]], None], key: str = ""
+    ) -> _OpenScene:
+        """A log's clips, all made when the first one is wanted. How many there are is kept in the cache, by the log's content."""
+        rules = self._rules
+        if source is not None:
+            key = f"{store.digest(source.scene)} {store.digest(source.fused)}"
+        said = store.json_text([key, asdict(rules), scored], indent=None)
+        folder = self._cache.folder / hashlib.sha256(said.encode()).hexdigest()[:24]
+        index = folder / "clips.json"
+
+        def make(of: LogSource) -> None:
+            windows = [replace(w, held_out=scored) for w in from_log.log_windows(read_scene(of.scene), rules)]
+            if index.is_file():
+                from_log.write_log(of, rules, list(enumerate(windows)), folder)
+            else:
+                store.write_json(index, {"clips": len(windows)})
+
+        if not index.is_file():
+            with_log(make)
+        with understood("the number of a log's clips", str(index)):
+            count = int(store.read_json(index)["clips"])
+
+        def find(number: int) -> Path:
+            def bring(path: Path) -> None:
+                try:
+                    with_log(make)
+                except (InputError, IntegrityError):
+                    if not path.is_file():  # else another clip of the log is at fault
+                        raise
+
+            return self._cache.get(f"{folder.name}/{clip_shards.shard_path(Path(), number).name}", bring)
+
+        return _OpenScene(tuple(range(count)), find)
+
+    def _of_remote_log(self, places: Sequence[Location], scored: bool) -> _OpenScene:
+        def with_log(make: Callable[[LogSource], None]) -> None:
+            store.make_folder(self._cache.folder)
+            staged = Path(tempfile.mkdtemp(prefix=".log-", dir=self._cache.folder))
+            try:
+                for place, name in zip(places, ("scene", "fused"), strict=False):
+                    place.fetch(staged / name)
+                text = f"{staged / 'scene'}={staged / 'fused'}" if len(places) == 2 else str(staged / "scene")
+                make(from_log.log_source(text))
+            finally:
+                shutil.rmtree(staged, ignore_errors=True)
+
+        facts = []
+        for place in places:
+            record = next((place / n for n in ("_contents.json", store.MANIFEST, "scene.json") if (place / n).exists()), None)
+            if record is None:
+                raise InputError("no clips and no log here", where=place.text,
+                    remedy="check the address, and whether its upload was finished")  # fmt: skip
+            facts.append(hashlib.sha256(record.load()).hexdigest())
+        return self._of_log(None, scored, with_log, " ".join(facts))

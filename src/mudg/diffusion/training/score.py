@@ -1,0 +1,241 @@
+"""Scores, pictures and the model card of the `learn` verb."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from mudg.base import html, palette, store
+from mudg.base.records import understood
+from mudg.base.types import Clip
+from mudg.core import metrics
+from mudg.core.metrics import TrueFrame, flicker
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
+from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion.clips.condition import filled_depth
+from mudg.diffusion.model import MDM
+from mudg.diffusion.published.model import PublishedMDM
+from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
+from mudg.diffusion.settings.learn import LearnConfig
+
+SKY = palette.ID["sky"]
+SCORES = (
+    ("psnr", "RGB PSNR dB"), ("psnr_seen", "- where seen"), ("psnr_unseen", "- unseen"), ("psnr_condition", "- of the condition"),
+    ("psnr_points", "- nearest point"), ("psnr_reference", "- points + one image"),
+    ("ssim", "SSIM"), ("sharpness", "sharpness (1 = truth)"), ("abs_rel", "depth AbsRel"), ("delta1", "delta1"),
+    ("abs_rel_nearest", "AbsRel nearest fill"), ("delta1_nearest", "delta1 nearest fill"), ("miou", "mIoU"), ("accuracy", "accuracy"),
+    ("flicker", "flicker (1 = truth)"),
+    ("sky_near", "sky nearer 80 m"), ("edges_agree", "depth edges on class edges"), ("confidence_gap", "confidence AUC"),
+)  # fmt: skip
+
+
+def score(
+    model: MDM | PublishedMDM,
+    cities: Sequence[int],
+    folder: Path | clip_shards.ShardSource,
+    request: SampleRequest,
+    *,
+    prepare: Callable[[Clip], Clip] | None = None,
+    picture: Path | None = None,
+) -> dict[str, Any]:
+    """Generate all clips of some cities and compare with the truth.
+
+    Args:
+        request: how clips are sampled; the index is put in for each.
+        prepare: changes each clip before it is used, for example `without_classes`.
+
+    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in
+    `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
+    """
+    rows: dict[str, list[dict[str, float]]] = {}
+    counts: dict[str, Tensor] = {}
+    pairs: list[tuple[Clip, GeneratedClip]] = []
+    for city in cities:
+        for number in range(clip_shards.clips_in(folder, city)):
+            frames = range(min(model.config.window, clip_shards.frames_in(folder, city)))
+            clip = clip_shards.read_clip(folder, city, number, frames)
+            clip = clip if prepare is None else prepare(clip)
+            sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
+            name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
+            row, matrix = score_clip(clip, sample)
+            rows.setdefault(name, []).append(row)
+            counts[name] = counts.get(name, torch.zeros_like(matrix)) + matrix
+            if len(pairs) < 6 and (clip.shift_m != 0 or number == 0):
+                pairs.append((clip, sample))
+    if picture is not None and pairs:
+        save_grid(picture, pairs)
+    by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
+    shifted = [n for n in rows if n != "recorded"] or list(rows)
+    pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))  # type: ignore[arg-type]
+    return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
+
+
+def without_classes(clip: Clip) -> Clip:
+    """The clip as of a log without labels: no class comes with the condition."""
+    return replace(clip, condition=replace(clip.condition, semantics=None, backdrop_semantics=None))
+
+
+def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
+    """Scores of one clip and its class confusion i64[19,20]."""
+    rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
+    depth = torch.where(clip.depth_weight == 1, clip.depth, clip_shards.FAR_M)  # far depth does not count, nor does guessed depth
+    seen = given.valid if given.warped is None else given.valid | given.warped
+    backdrop = given.color if given.backdrop is None else given.backdrop
+    frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
+    solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
+    flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
+    error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
+    filled = given.depth if given.measured is None else filled_depth(given.measured)
+    nearest = metrics.depth_errors(flat(filled), flat(depth), flat(solid))
+    matrix = metrics.confusion(sample.semantics.flatten(0, 1), ids.flatten(0, 1))
+    sky = (ids == SKY).unsqueeze(1)
+    wrong = (sample.rgb - rgb).abs().mean(1, keepdim=True)
+    one_image = rgb if points is None else torch.where(given.valid, points, backdrop)
+    row = {
+        "psnr": metrics.psnr(flat(sample.rgb), flat(rgb)),
+        "psnr_seen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(seen)),
+        "psnr_unseen": metrics.psnr(flat(sample.rgb), flat(rgb), flat(~seen)),
+        "psnr_condition": metrics.psnr(flat(given.color), flat(rgb)),
+        "psnr_points": math.nan if points is None else metrics.psnr(flat(points), flat(rgb)),
+        "psnr_reference": math.nan if points is None else metrics.psnr(flat(one_image), flat(rgb)),
+        "ssim": float(np.mean([metrics.ssim(a, b) for a, b in zip(sample.rgb, rgb)])),
+        "sharpness": _gradient(sample.rgb) / max(_gradient(rgb), 1e-6),
+        "abs_rel": error.abs_rel,
+        "delta1": error.delta1,
+        "abs_rel_nearest": nearest.abs_rel,
+        "delta1_nearest": nearest.delta1,
+        "flicker": flicker(sample.rgb, rgb, frames),
+        "sky_near": float((sample.depth[sky] < 80).float().mean()) if bool(sky.any()) else math.nan,
+        "edges_agree": edges_agree(sample.depth, sample.semantics),
+        "confidence_gap": _auc(sample.confidence.flatten(), wrong.flatten()),
+    }
+    return row, matrix
+
+
+def edges_agree(depth: Tensor, semantics: Tensor) -> float:
+    """Share of depth edges (ratio of neighbours > 1.25) that lie within a pixel of a class edge. NaN without edges."""
+    log_depth = depth.clamp(min=0.1).log()
+    tall = ((log_depth[..., 1:, :] - log_depth[..., :-1, :]).abs() > 0.223)[..., :-1]
+    wide = ((log_depth[..., 1:] - log_depth[..., :-1]).abs() > 0.223)[..., :-1, :]
+    edge = tall | wide
+    ids = semantics.unsqueeze(1)
+    change = (ids[..., 1:, :-1] != ids[..., :-1, :-1]) | (ids[..., :-1, 1:] != ids[..., :-1, :-1])
+    near = torch.nn.functional.max_pool2d(change.float(), 3, stride=1, padding=1) > 0
+    return float((edge & near).sum() / edge.sum()) if bool(edge.any()) else math.nan
+
+
+def _gradient(rgb: Tensor) -> float:
+    return float((rgb[..., 1:] - rgb[..., :-1]).abs().mean() + (rgb[..., 1:, :] - rgb[..., :-1, :]).abs().mean())
+
+
+def _auc(confidence: Tensor, error: Tensor, pairs: int = 20000) -> float:
+    """Probability that of two pixels the one with more error has less confidence (0.5 = no use, 1 = perfect)."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randint(len(error), (2, pairs), generator=generator)
+    right = ((error[a] > error[b]) == (confidence[a] < confidence[b])).float()
+    tie = confidence[a] == confidence[b]
+    return float(torch.where(tie, torch.full_like(right, 0.5), right).mean())
+
+
+def _average(rows: Sequence[Mapping[str, float]], counts: Tensor) -> dict[str, float]:
+    result: dict[str, float] = {}
+    for name in rows[0]:
+        values = [r[name] for r in rows if math.isfinite(r[name])]
+        if values:
+            result[name] = round(float(np.mean(values)), 4)
+    if not bool(counts.any()):  # logs without labels
+        return result
+    ious = metrics.iou_of(counts)
+    frequent = {n: v for n, v in ious.items() if float(counts[palette.ID[n]].sum()) > 2e-4 * float(counts.sum())}
+    result["miou"] = round(float(np.mean(list(frequent.values()))), 4)
+    result["miou_all"] = round(float(np.mean(list(ious.values()))), 4)
+    result["accuracy"] = round(float(counts[:, :-1].diagonal().sum() / counts.sum()), 4)
+    return result | {f"iou {n}": round(v, 3) for n, v in ious.items()}
+
+
+def table(scores: Mapping[str, Any]) -> str:
+    """Scores as text, one column per shift."""
+    columns = {**scores["by_shift"], "shifted": scores["average"]}
+    lines = [f"{'':28s}" + "".join(f"{c:>11s}" for c in columns)]
+    for key, title in SCORES:
+        cells = (columns[c].get(key) for c in columns)
+        lines.append(f"{title:28s}" + "".join(f"{'-' if v is None else format(v, '.3f'):>11s}" for v in cells))
+    return "\n".join(lines)
+
+
+# pictures -------------------------------------------------------------------------------------------------------------
+
+
+def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
+    """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
+    rows = []
+    for clip, sample in pairs:
+        t = min(frame, len(sample.confidence) - 1)
+        given = clip.condition
+        measured = torch.where(given.measurement.valid[t], given.measurement.depth[t], 100.0)
+        cells = [
+            *(to_bytes(rgb) for rgb in (given.color[t], sample.rgb[t], clip.rgb[t])),
+            *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
+            *(class_colors(ids.numpy()) for ids in (sample.semantics[t], clip.semantics[t])),
+            gray(sample.confidence[t, 0].numpy()),
+        ]  # fmt: skip
+        rows.append(np.concatenate(cells, 1))
+    store.write_image(path, np.concatenate(rows, 0))
+
+
+def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420) -> None:
+    """Draw the loss terms over the steps, both axes logarithmic, from the lines of log.jsonl."""
+    points: dict[str, dict[int, float]] = {}
+    for line in store.read_text(log_file).splitlines():
+        with understood("a log of losses", str(log_file)):
+            entry = store.parse_json(line, str(log_file))
+            if "total" in entry and "step" in entry:
+                for name in ("total", "rgb", "depth", "semantics"):
+                    if name in entry:  # separate passes: a step has one modality
+                        points.setdefault(name, {})[int(entry["step"])] = float(entry[name])
+    series = {n: sorted(p.items()) for n, p in points.items()}
+    values = [v for p in series.values() for _, v in p if v > 0 and math.isfinite(v)]
+    if not values:
+        return
+    image = Image.new("RGB", (width, height), "white")
+    draw = ImageDraw.Draw(image)
+    last = max(s for p in series.values() for s, _ in p)
+    low, high = math.log10(min(values)) - 0.05, math.log10(max(values)) + 0.05
+    left = math.log10(50)
+    right = max(left + 0.01, math.log10(max(last, 1)))
+
+    def place(step: int, value: float) -> tuple[float, float]:
+        x = 50 + (width - 70) * (math.log10(max(step, 50)) - left) / (right - left)
+        return x, 20 + (height - 50) * (high - math.log10(max(value, 1e-9))) / (high - low)
+
+    for power in np.arange(math.floor(low * 5) / 5, high, 0.2):
+        if low < power:
+            y = place(50, 10**power)[1]
+            draw.line([(50, y), (width - 20, y)], fill="#dddddd")
+            draw.text((4, y - 6), f"{10**power:.3f}", fill="black")
+    for (name, line), color in zip(series.items(), ("black", "#c03030", "#2050c0", "#209050"), strict=False):
+        draw.line([place(s, v) for s, v in line], fill=color, width=2)
+        draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
+    draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
+    store.write_image(path, image)
+
+
+# model card -----------------------------------------------------------------------------------------------------------
+
+
+def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
+    """Text that travels with the weights: what it is, how it was made, what it can and cannot do.
+
+    `data` says what it was trained on; empty = generated cities.
+    """
+    parameters = sum(p.numel() for p in model.parameters())
+    return html.render_text("mdm_card.md.j2", data=data, refines=model.refiner is not None, parameters=parameters, config=config,
+                            clips=config.data, rules=config.optimizer, scores=scores, table=table(scores))  # fmt: skip

@@ -1,0 +1,1 @@
+"""Drives changed as a script says: on fitted scenes, clouds, images and sweeps."""

@@ -1,0 +1,110 @@
+"""edit: a drive changed as a script says -> an edited fit, or an edited run that every other command takes like any other.
+
+of a fit:              OUT/model.json ... (as ``fit`` writes)
+of a ``mudg run``:     OUT/scene  OUT/fuse  OUT/fit/<method>  OUT/lidar.json what became of LiDAR returns
+of both:               OUT/edits.yaml the script with all defaults   OUT/edit.json what was done, collisions, seldom-seen sides
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mudg.base import log, store
+from mudg.base.errors import UsageError
+from mudg.base.records import understood
+from mudg.base.run_folder import RunDir
+from mudg.base.types import FusedCloud, Scene
+from mudg.core.raster.place import drawing_device
+from mudg.editing.carried import EditedDrive, carry_out
+from mudg.editing.harmonised import check_paths, repairing
+from mudg.editing.recorded import DriveChange, EditedImages, write_edited_scene
+from mudg.editing.runs import RunParts
+from mudg.editing.script import EditScript
+from mudg.editing.settings import EditConfig
+from mudg.editing.weathered import conditions_of
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.storage import load_model, model_of_scene, save_model
+from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.read import read_scene
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedEdit:
+    """A script carried out in memory, and what it was carried out on. made: the edited fit."""
+
+    script: EditScript
+    parts: RunParts
+    scene: Scene | None
+    model: SceneModel
+    drive: EditedDrive
+    made: SceneModel
+
+    @classmethod
+    def of(cls, config: EditConfig, script: EditScript, parts: RunParts) -> PlannedEdit:
+        """Carry out a script on the parts of a run; nothing is written.
+
+        Raises:
+            InputError: the script asks for what cannot be done. UsageError: repairs of images that there are not.
+        """
+        loaded = None if parts.scene is None else read_scene(parts.scene)
+        model = load_model(parts.model) if loaded is None else model_of_scene(parts.model, loaded)
+        drive = carry_out(script, model, loaded, None if parts.fused is None else read_fused(parts.fused))
+        if parts.whole and conditions_of(script.canonical()) is not None:
+            beams = "its LiDAR sweeps are in fog and rain" if drive.plan.weather_of_beams else "so do its LiDAR sweeps"
+            log.info(f"edit: `mudg render` shows weather and light; images of the edited scene stay as recorded, {beams}")
+        if parts.whole and drive.plan.background is not None:
+            log.info("edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured that street")
+        if config.harmonize.on and not parts.whole:
+            raise UsageError("a fit by itself has no images to repair", where="--harmonize.on",
+                remedy="edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`")  # fmt: skip
+        if config.harmonize.on and loaded is not None:
+            check_paths(config.harmonize, {name: len(loaded.frames_of(name)) for name in loaded.cameras if loaded.frames_of(name)})
+        return cls(script, parts, loaded, model, drive, drive.model(model, keep_ego=not parts.whole))
+
+    def write(self, config: EditConfig, work: RunDir) -> dict[str, Any]:
+        """Write the edited fit or run, and what was done; returns a summary."""
+        out, plan, device = work.path, self.drive.plan, drawing_device(config.device, "render", config.raster)
+        changed: dict[str, Any] = {"changed": list(plan.changes), "removed": plan.removed, "inserted": list(plan.inserted)}
+        if self.parts.whole and self.scene is not None:
+            images = EditedImages(self.model.to(device), self.made.to(device), config, plan.moves_ego or plan.background is not None)
+            images = repairing(images, self.drive, self.scene) if config.harmonize.on else images
+            changed["lidar"] = _write_run(self.drive, self.parts, self.scene, images, out)
+        else:
+            save_model(self.made, out)
+        store.write_text(out / "edits.yaml", self.script.text())
+        conditions = {verb: settings.model_dump(mode="json") for verb, settings in plan.conditions.items()}
+        store.write_json(out / "edit.json", {
+            "schema": 1, "digest": work.inputs["edits"], **changed, "ego": plan.moves_ego, "conditions": conditions,
+            "notes": self.drive.notes,
+        })  # fmt: skip
+        return {**changed, "notes": len(self.drive.notes)}
+
+
+def _write_run(drive: EditedDrive, parts: RunParts, scene: Scene, images: EditedImages, out: Path) -> dict[str, int]:
+    """Scene, clouds and fits of an edited run; what an interrupted one finished is kept. Returns what became of LiDAR returns."""
+    edited, cloud = drive.scene, drive.cloud
+    if edited is None or cloud is None:  # both were given
+        return {}
+    if not (out / "fuse" / "fuse.json").is_file():
+        write_fused(out / "fuse", cloud, _report_of(parts, cloud))
+    if not (out / "scene" / "scene.json").is_file():
+        counts = write_edited_scene(scene, DriveChange(drive.plan, edited, cloud), images, out / "scene").record()
+        store.write_json(out / "lidar.json", {"schema": 1, **counts})
+    for name, path in parts.fits.items():
+        if not (out / "fit" / name / "model.json").is_file():
+            save_model(images.after if path == parts.model else drive.model(load_model(path)), out / "fit" / name)
+    with understood("counts of LiDAR returns", str(out / "lidar.json")):
+        return {name: int(value) for name, value in store.read_json(out / "lidar.json").items() if name != "schema"}
+
+
+def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
+    """What the fused clouds' report says of objects that are still there."""
+    if parts.fused is None:
+        return {}
+    report = store.read_json(parts.fused / "fuse.json")
+    own = ("format", "schema_version", "static", "objects", "camera_colors")
+    with understood("a report of fused clouds", str(parts.fused / "fuse.json")):
+        kept = {key: value for key, value in report.items() if key not in own}
+        return {**kept, "tracks": {key: value for key, value in kept.get("tracks", {}).items() if key in cloud.objects}}

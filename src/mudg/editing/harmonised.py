@@ -1,0 +1,382 @@
+"""Views of an edited scene in which a diffusion model repairs what the edits touched, and nothing else.
+
+1. Touched are the pixels whose renders with and without the edits differ, near the boxes of what was removed, moved or put in; and the
+   ground about them where recorded photographs of other moments show it brighter: a shadow that stayed.
+2. The model's condition is that of the edited drive (``editing/recorded.py``): points of removed objects are gone, those of moved
+   ones moved; photographs do not count where such objects or their shadows were; the renders are those of the edited scene.
+   What the photographs determined behind something that is gone (certainty of the render) stays as rendered.
+3. The sample begins from the edited render. Untouched pixels stay at it at every step; touched ones are free from the noise level on that
+   belongs to their kind (``HarmonizeConfig.uncovered``, ``.objects``).
+4. Guard: where the model shows a road user in place of one that was removed, or none where one was put, the render stays.
+5. The generated pixels are pasted into the render with a soft edge that lies inside the touched pixels: every other pixel keeps its bits.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base import log
+from mudg.base.errors import UsageError
+from mudg.base.palette import DYNAMIC_IDS
+from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
+from mudg.diffusion import views as loading
+from mudg.diffusion.clips.condition import GROUND_IDS, ConditionRules, WarpSource, determined
+from mudg.diffusion.clips.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion.published.model import is_published, window_of
+from mudg.diffusion.requests import StartClip, generated
+from mudg.diffusion.settings.harmonize import HarmonizeConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
+from mudg.editing.carried import EditedDrive
+from mudg.editing.plan import EditPlan
+from mudg.editing.recorded import (
+    CHANGED_ABOVE,
+    GROWN_PX,
+    EditedImages,
+    boxes_mask,
+    cleared_cloud,
+    ground_mask,
+    others,
+    photos_of_edited,
+    touched_boxes,
+    vacated_at,
+)
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import FAR_M, raster_of, render_planes, render_view
+from mudg.networks.codec import Modality
+
+DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
+FEATHER_PX: Final = 3
+"""Generated pixels fade into the render over this many pixels, inside of what the edit touches."""
+BRIGHTER: Final = 0.02
+"""Ground that other moments show brighter than the render by this, 0 to 1, lay in a shadow."""
+CONTACT_REACH: Final = 0.2
+"""The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer what was uncovered."""
+OVERLAP: Final = 2
+"""Frames that windows share."""
+PUBLISHED_OVERLAP: Final = 8
+"""The same for published-type models."""
+
+
+def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
+    """How the model of a configuration samples.
+
+    Raises:
+        UsageError: a published-type model is to leave a render part of the way: it makes its clips from noise alone.
+    """
+    strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
+    partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
+    if partial and is_published(config.model):
+        raise UsageError("a published-type model makes views from noise: it cannot stay near a render", where=partial[0].split()[0],
+            expected="0 or 1", got=partial[0].split()[1])  # fmt: skip
+    return SynthesizeConfig(
+        model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
+    )
+
+
+def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:
+    """UsageError for what a published-type model cannot do with paths of so many frames, by name, before anything is written."""
+    settings_of(config, "cpu")
+    short = {name: count for name, count in frames.items() if is_published(config.model) and count < window_of(config.model)}
+    for name, count in short.items():
+        raise UsageError("a path is too short for a published-type model, whose clips have a fixed number of frames", where=name,
+            expected=f"at least {window_of(config.model)} frames", got=str(count), remedy="harmonise with a small model")  # fmt: skip
+
+
+DrawPair = Callable[[View], tuple[Observation, Observation]]
+"""Renders of a view without and with the edits."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touched:
+    """Pixels bool[H,W] of a view that edits touch, by kind: `objects` that were moved or put in, with their shadows; `uncovered`: what
+    such and removed objects stood before; `shaded`: ground where a recorded shadow may have stayed."""
+
+    objects: Tensor
+    uncovered: Tensor
+    shaded: Tensor
+
+    @property
+    def any(self) -> Tensor:
+        """All of them."""
+        return self.objects | self.uncovered | self.shaded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditedSources:
+    """What the diffusion model is told of an edited drive.
+
+    Args:
+        fitted: its fitted scene. cloud: edited clouds, without what was left behind (``cleared_cloud``).
+        tracks: edited boxes. photos: recorded images with the pixels marked that do not show the edited drive.
+    """
+
+    fitted: SceneModel
+    plan: EditPlan
+    cloud: FusedCloud
+    tracks: Sequence[Track]
+    photos: Sequence[Photo]
+
+    @classmethod
+    def of(cls, drive: EditedDrive, fitted: SceneModel, recorded: Scene) -> EditedSources:
+        """Of a script that was carried out on a scene with its clouds.
+
+        Args:
+            fitted: edited. recorded: the scene as it was.
+        """
+        if drive.scene is None or drive.cloud is None:
+            raise UsageError("the diffusion model needs the fused clouds of the drive", remedy="give --fused, as `mudg fuse` wrote it")
+        plan, edited, cloud = drive.plan, drive.scene, drive.cloud
+        photos = photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
+        return cls(fitted, plan, cleared_cloud(cloud, plan), edited.tracks, photos)
+
+
+def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation]) -> Touched:
+    """What edits touch in a view.
+
+    Args:
+        pictures: renders of the view without and with the edits.
+    """
+    usual, made = pictures
+    before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
+    differs = ((made.rgb - usual.rgb).abs().amax(0) > CHANGED_ABOVE).numpy()
+    differs = np.asarray(ndimage.binary_dilation(differs, iterations=GROWN_PX), bool) if differs.any() else differs
+    old_ground, new_box, new_ground = ground_mask(view, before), boxes_mask(view, after), ground_mask(view, after)
+    near = new_box | ground_mask(view, after, CONTACT_REACH)
+    uncovered = differs & (boxes_mask(view, before) | old_ground) & ~near
+    objects = differs & (near | new_ground) & ~uncovered
+    ids = torch.full(made.rgb.shape[1:], 255) if made.semantics is None else made.semantics
+    shaded = old_ground & torch.isin(ids, GROUND_IDS.long()).numpy() & ~new_box & ~uncovered & ~objects
+    return Touched(*(torch.from_numpy(mask) for mask in (objects, uncovered, shaded)))
+
+
+def soft_edge(mask: NDArray[np.bool_]) -> Tensor:
+    """Weights f32[H,W]: 0 outside of a mask, growing to 1 over `FEATHER_PX` pixels inside."""
+    inner = ndimage.distance_transform_edt(mask)
+    return torch.from_numpy(np.clip(np.asarray(inner) / (FEATHER_PX + 1), 0, 1).astype(np.float32))
+
+
+def start_clip(renders: Sequence[Observation], freedom: Sequence[Tensor], size: tuple[int, int]) -> StartClip:
+    """Renders, of whatever size, as the clip of height and width ``size`` that a sample begins from; ``freedom`` f32[H,W] of them."""
+    area = lambda x: functional.interpolate(x, size=size, mode="area")  # noqa: E731
+    picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
+    unknown = torch.full_like(renders[0].rgb[0], 255)
+    depth = [torch.full_like(unknown, FAR_M)[None] if r.depth is None else r.depth.nan_to_num(FAR_M) for r in renders]
+    ids = [unknown if r.semantics is None else r.semantics.float() for r in renders]
+    return StartClip(
+        area(torch.stack([r.rgb for r in renders])), picked(torch.stack(depth)), picked(torch.stack(ids)[:, None]).to(torch.uint8),
+        functional.adaptive_max_pool2d(torch.stack(list(freedom))[:, None].float(), size),
+    )  # fmt: skip
+
+
+def guarded(touched: Touched, render: Observation, made: Observation, other_boxes: NDArray[np.bool_]) -> Tensor:
+    """Pixels bool[H,W] of `touched` whose generated class agrees with the edits: no road user came back where one was removed (but for
+    those whose `other_boxes` bool[H,W] are there), and none vanished where the render has one."""
+    if render.semantics is None or made.semantics is None:
+        return touched.any
+    there, wanted = (torch.isin(seen.semantics, DYNAMIC.long()) for seen in (made, render))
+    back = (touched.uncovered | touched.shaded) & there & ~torch.from_numpy(other_boxes)
+    gone = touched.objects & wanted & ~there
+    return touched.any & ~back & ~gone
+
+
+def pasted(render: Observation, made: Observation, weight: Tensor) -> Observation:
+    """The render with generated colours of weight f32[H,W]; depth and classes are the generated ones where these weigh more than half.
+    Where the weight is 0 every value keeps its bits."""
+    inside, most = weight > 0, weight > 0.5
+    rgb = torch.where(inside, torch.lerp(render.rgb, made.rgb, weight), render.rgb)
+    chosen = lambda mine, theirs: mine if mine is None or theirs is None else torch.where(most, theirs.to(mine.dtype), mine)  # noqa: E731
+    return replace(
+        render, rgb=rgb.clamp(0, 1) if bool(inside.any()) else rgb, depth=chosen(render.depth, made.depth),
+        semantics=chosen(render.semantics, made.semantics), confidence=torch.where(most, made.confidence, render.confidence),
+    )  # fmt: skip
+
+
+class Harmoniser:
+    """Repairs the views of an edited scene, window after window along a path."""
+
+    def __init__(self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto") -> None:
+        """``size``: width and height of the views."""
+        self._settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
+        self._sources, self._config = sources, config
+        model = loading.load_any(self._settings)
+        self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
+        self._overlap = min(overlap, self.window - 1)
+        width, height = model.image_size(*size, 0)
+        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone)
+        given = ConditionSources(
+            sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
+            vacated_at(sources.plan),
+        )  # fmt: skip
+        self._maker = ViewMaker(model, given, self._settings, None if model.points_alone else self._start_at)
+        self._parts: list[tuple[Observation, Touched]] = []
+
+    def _start_at(self, views: Sequence[View]) -> StartClip:
+        """The renders of the window that is being made, at the size that the model works at."""
+        size = views[0].camera.height, views[0].camera.width
+        renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
+        freedom = [self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched]
+        return start_clip(renders, freedom, size)
+
+    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
+        """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits do not touch."""
+        done, tail = 0, dict[Modality, Tensor]()
+        parts: dict[int, tuple[Observation, Touched]] = {}
+        for number, span in enumerate(windows(len(views), self.window, self._overlap)):
+            parts = {i: parts[i] if i in parts else self._part(views[i], draw) for i in span}
+            if not any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values()):
+                yield from (parts[i][0] for i in span if i >= done)
+                done, tail = span.stop, {}
+                continue
+            self._parts = list(parts.values())
+            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
+            sample, _, generated = self._maker.make([views[i] for i in span], number, known)
+            yield from [self._repaired(*parts[i], generated[i - span.start]) for i in span if i >= done]
+            done, tail = span.stop, sample.latents
+
+    def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
+        usual, made = draw(view)
+        touched = touched_pixels(self._sources.plan, view, (usual, made))
+        if not bool(touched.uncovered.any()):
+            return made, touched
+        sure = determined(render_planes(self._sources.fitted, view), ~touched.any)
+        return made, replace(touched, uncovered=touched.uncovered & ~sure)
+
+    def _repaired(self, render: Observation, touched: Touched, made: Observation) -> Observation:
+        brighter = (made.rgb - render.rgb).mean(0).numpy()
+        lit = touched.shaded & torch.from_numpy(ndimage.uniform_filter(brighter, 5) > BRIGHTER)
+        objects = touched.objects & (self._config.objects > 0)
+        touched = replace(touched, shaded=lit & (self._config.uncovered > 0), objects=objects)
+        boxes = boxes_mask(render.view, others(self._sources.plan, render.view.time_s))
+        kept = guarded(touched, render, made, boxes) & made.mask[0]
+        return pasted(render, made, soft_edge(kept.numpy()))
+
+
+def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> EditedImages:
+    """The same with every image of an edited run repaired, camera by camera.
+
+    Args:
+        recorded: the scene as it was; the views are those of the edited one.
+    """
+    raster, edited = raster_of(images.before, images.config.raster), drive.scene or recorded
+    sources, config = EditedSources.of(drive, images.after, recorded), images.config.harmonize
+    draw = lambda view: (render_view(images.before, view, raster), render_view(images.after, view, raster))  # noqa: E731
+    views = {name: [f.view for f in edited.frames if f.view.camera.name == name] for name in edited.cameras}
+    made = {
+        name: Harmoniser(sources, config, (mine[0].camera.width, mine[0].camera.height), images.config.device).along(mine, draw)
+        for name, mine in views.items() if mine
+    }  # fmt: skip
+    return replace(images, repaired=made)
+
+
+class AlongPaths(Protocol):
+    """What changes the views of a path, in order."""
+
+    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
+        """The views, changed; ``draw`` makes each without and with the edits."""
+        ...
+
+
+class RepairedViews:
+    """Draws the views of paths repaired, one path at a time and in order; any other view as the renders show it."""
+
+    def __init__(self, harmoniser: AlongPaths, draw: DrawPair) -> None:
+        self._harmoniser, self._draw = harmoniser, draw
+        self._left: Iterator[tuple[View, Observation]] = iter(())
+        self._views: tuple[View, ...] = ()
+
+    def follow(self, path: Trajectory) -> None:
+        """Views of this path come next."""
+        self._views = path.views
+        self._left = zip(path.views, self._harmoniser.along(path.views, self._draw))
+
+    def __call__(self, view: View) -> Observation:
+        """The view; of a path that is followed, repaired."""
+        if not any(view is own for own in self._views):
+            return self._draw(view)[1]
+        return next(made for own, made in self._left if own is view)
+
+
+# harmonised weather ---------------------------------------------------------------------------------------------------
+#
+# Views in other weather or light that a published-type diffusion model makes, after the formulas of `core.weather`.
+#
+# The model is given points and a reference image in that weather, as in the paper's figure of edited backgrounds, and makes the view from
+# noise. It works at its own size: what it changes there is enlarged and added to the render, which so keeps its detail. Depth, classes
+# and
+# confidence stay as rendered.
+
+
+def harmonises_weather(config: HarmonizeConfig, how: InWeather) -> bool:
+    """Whether a diffusion model corrects this weather; says so where it was asked for and cannot be."""
+    if not how.settings.changes_air_ground_or_light:
+        return False
+    published = is_published(config.model)
+    if config.weather > 0 and published:
+        return True
+    why = "--harmonize.weather is 0" if published else f"{config.model} is no published-type model"
+    log.info(f"weather and light are those of the formulas alone: {why}")
+    return False
+
+
+class WeatherHarmoniser:
+    """Corrects views in other weather, window after window along a path."""
+
+    def __init__(
+        self,
+        sources: EditedSources,
+        how: InWeather,
+        config: HarmonizeConfig,
+        size: tuple[int, int],
+        device: str = "auto",
+    ) -> None:
+        """``size``: width and height of the views."""
+        settings = loading.check_config(settings_of(config, device), fitted=False)
+        self._model = loading.load_any(settings)
+        self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
+        width, height = self._model.image_size(*size, 0)
+        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
+        self._given = ConditionSources(
+            sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
+            vacated_at(sources.plan), how,
+        )  # fmt: skip
+        self._kept: dict[int, WarpSource] = {}
+
+    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
+        """The views of a path, in order, corrected; ``draw`` makes each without and with the weather."""
+        done, tail = 0, dict[Modality, Tensor]()
+        renders: dict[int, Observation] = {}
+        window = self._model.config.window
+        for number, span in enumerate(windows(len(views), window, min(PUBLISHED_OVERLAP, window - 1))):
+            renders = {i: renders[i] if i in renders else draw(views[i])[1] for i in span}
+            condition = conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0]
+            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
+            clip = generated(self._model, condition, replace(self._request, index=number, known=known))
+            elsewhere = not recorded_at_pose(views[span.start], self._given.recorded)  # frame 0 is the reference
+            for i in span:
+                if i >= done:
+                    stays = elsewhere and i == span.start
+                    yield renders[i] if stays else corrected(renders[i], clip.rgb[i - span.start])
+            done, tail = span.stop, clip.latents
+
+
+def corrected(render: Observation, made: Tensor) -> Observation:
+    """A render with what `made` f32[3,h,w], of any size, changes of it (see `changed_by`)."""
+    return replace(render, rgb=changed_by(render.rgb, made))
+
+
+def changed_by(rgb: Tensor, made: Tensor) -> Tensor:
+    """Colours f32[3,H,W] with what `made` f32[3,h,w], of any size, changes of them at that size."""
+    area = functional.interpolate(rgb[None], size=made.shape[-2:], mode="area")
+    change = functional.interpolate(made[None] - area, size=rgb.shape[-2:], mode="bilinear", align_corners=False)[0]
+    return (rgb + change).clamp(0, 1)

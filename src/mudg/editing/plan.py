@@ -1,0 +1,608 @@
+"""From a script to what is to happen: every verb in order, on the paths of all road users and of the vehicle.
+
+Boxes of a scene and objects of a fitted scene lie almost in the same places, but not quite: a fit corrects boxes. So a plan keeps
+what is done to a path as functions, to be applied to either.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, MudgError, UsageError, nearest
+from mudg.base.types import PointCloud, Scene, View
+from mudg.base.weather_settings import WeatherSettings
+from mudg.core import edit as boxes
+from mudg.core import edit as paths
+from mudg.core.edit import Displacement, HeightMap, Motion
+from mudg.editing.model import Asset, motion_of
+from mudg.editing.script import EGO, AssetSource, EditScript, ScriptEdit
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode
+
+Change = Callable[[Motion], Motion]
+OpenAsset = Callable[[AssetSource], Asset]
+"""Reads the object that a script names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Background:
+    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground; its fused points and the mean light f64[3] of its
+    surfaces, if they are known."""
+
+    model: SceneModel
+    ego: Motion
+    ground_xyz: np.ndarray
+    points: PointCloud | None = None
+    light_rgb: np.ndarray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EditSources:
+    """Reads what a script names: objects, and backgrounds by the path that is written there."""
+
+    asset: OpenAsset
+    background: Callable[[str], Background]
+    close_street: bool = False
+    """Whether the street is closed behind what leaves its place, where a script does not say."""
+
+
+SAME_PLACE_M: Final = 1e-4
+MOVING_M: Final = 1.0
+"""An object moves if its box gets farther than this from its first place."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Actor:
+    """A road user: class, box size in metres, path of the box's centre."""
+
+    label: str
+    size_m: tuple[float, float, float]
+    motion: Motion
+
+    @property
+    def moves(self) -> bool:
+        """Whether its box leaves its place."""
+        places = self.motion.poses[:, :3, 3]
+        return bool(np.linalg.norm(places - places[0], axis=1).max() > MOVING_M)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditWorld:
+    """What a script can speak of.
+
+    Args:
+        actors: by id. ego: path of the vehicle, None where only a fitted scene is given. ground: None = heights are not known.
+    """
+
+    actors: Mapping[str, Actor]
+    ego: Motion | None = None
+    ground: HeightMap | None = None
+
+    @classmethod
+    def of_scene(cls, scene: Scene, ground: HeightMap | None) -> EditWorld:
+        """All boxes of a scene and its vehicle."""
+        actors = {
+            track.id: Actor(track.label, _three(track.size_m), Motion.recorded(track.times_s, track.world_from_object))
+            for track in scene.tracks
+        }
+        return cls(actors, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
+
+    @classmethod
+    def of_model(cls, model: SceneModel, ground: HeightMap | None) -> EditWorld:
+        """The objects of a fitted scene."""
+        nodes = [node for node in model.nodes if isinstance(node, RigidNode)]
+        return cls({node.name: Actor(node.label, _three(node.size_m), motion_of(node)) for node in nodes}, None, ground)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Insertion:
+    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene; the direction f64[3] towards
+    the sun that casts its shadow, or None."""
+
+    asset: Asset
+    shadow: float
+    match_light: bool
+    sun: np.ndarray | None = None
+
+
+@dataclass(slots=True, eq=False)
+class EditPlan:
+    """What a script does.
+
+    Args:
+        before, after: the world, its actors and the vehicle, without and with the edits.
+        changes: what is done to the path of an actor of the recording, in order.
+        removed: actors of the recording that are not there any more. inserted: new ones, by id.
+        sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
+        match_objects: whether the objects that are kept take the light of that street. objects_gain: by which factor f64[3] of
+            their linear light, or None.
+        conditions: records of weather, light and season.
+        notes: what the reader should know, with numbers.
+        views: recorded ones, which say what nobody saw of the street; none where there is no scene.
+        closed: actors without whose traces the street is to be shown, if they were recorded (``editing/street.py``).
+        sides: actors whose sides that no view showed are to be closed (``editing/street.py``).
+    """
+
+    before: EditWorld
+    after: EditWorld
+    changes: dict[str, list[Change]] = field(default_factory=dict)
+    removed: list[str] = field(default_factory=list)
+    inserted: dict[str, Insertion] = field(default_factory=dict)
+    sky: Any = None
+    background: tuple[Background, np.ndarray] | None = None
+    match_objects: bool = False
+    objects_gain: np.ndarray | None = None
+    conditions: dict[str, Any] = field(default_factory=dict)
+    notes: list[dict[str, Any]] = field(default_factory=list)
+    moves_ego: bool = False
+    views: tuple[View, ...] = ()
+    closed: set[str] = field(default_factory=set)
+    sides: set[str] = field(default_factory=set)
+
+    def changed(self, name: str, motion: Motion) -> Motion:
+        """The path of an actor of the recording with all that is done to it."""
+        return functools.reduce(lambda now, change: change(now), self.changes.get(name, ()), motion)
+
+    def touched(self) -> tuple[str, ...]:
+        """Ids of actors whose path or looks are new."""
+        return tuple(dict.fromkeys([*(name for name in self.changes if name in self.after.actors), *self.inserted]))
+
+    @property
+    def weather_of_beams(self) -> WeatherSettings | None:
+        """Weather that LiDAR beams go through: with fog or rain, else None."""
+        weather = self.conditions.get("weather")
+        return weather if weather is not None and (weather.fog or weather.rain) else None
+
+
+_DISPLACING: Final = frozenset({"move", "stop", "speed", "lane_change", "path"})
+"""Verbs after which an object is not where it was recorded."""
+
+
+def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> EditPlan:
+    """Carry out a script on paths.
+
+    Raises:
+        InputError: an id that does not exist, or something that cannot be done; the message names the line and the verb.
+    """
+    plan = EditPlan(world, world, conditions=script.conditions())
+    for edit in script.edits:
+        if edit.verb in plan.conditions:
+            continue
+        try:
+            _VERBS[edit.verb](plan, edit.settings, sources)
+            if edit.verb in _DISPLACING:
+                _close(plan, edit.settings.id, edit.settings, sources)
+                (plan.sides.add if edit.settings.close_sides else plan.sides.discard)(edit.settings.id)
+        except (InputError, UsageError) as problem:
+            raise _located(problem, edit) from problem
+    plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
+    others = set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted) if EGO in plan.sides else set()
+    plan.sides = plan.sides & set(plan.changes) - {EGO} | others  # from another path of the vehicle, all are seen anew
+    return plan
+
+
+def _left_its_place(plan: EditPlan, name: str) -> bool:
+    before, after = (world.actors.get(name) for world in (plan.before, plan.after))
+    if before is None or after is None or name in plan.inserted:
+        return before is not None
+    old, new = before.motion.poses, after.motion.poses
+    return old.shape != new.shape or not np.allclose(old, new, atol=SAME_PLACE_M)
+
+
+def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
+    where = f"{edit.where}: {edit.verb}" + (f".{problem.where}" if problem.where else "")
+    return InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=problem.remedy)
+
+
+# -- verbs ---------------------------------------------------------------------------------------------------------------
+
+
+def _remove(plan: EditPlan, given: Any, sources: EditSources) -> None:
+    names = given.ids if given.ids is not None else _chosen(plan.after, given)
+    for name in names:
+        _actor(plan.after, name)
+        _take_away(plan, name)
+        _close(plan, name, given, sources)
+
+
+def _close(plan: EditPlan, name: str, given: Any, sources: EditSources) -> None:
+    """Note whether the street is to be closed behind an object; the last edit that says so counts."""
+    if name == EGO or (given.close_street is None and not sources.close_street):
+        return
+    (plan.closed.discard if given.close_street is False else plan.closed.add)(name)
+
+
+def _take_away(plan: EditPlan, name: str) -> None:
+    plan.inserted.pop(name, None)
+    if name in plan.before.actors and name not in plan.removed:
+        plan.removed.append(name)
+        plan.changes.pop(name, None)
+    plan.after = replace(plan.after, actors={key: value for key, value in plan.after.actors.items() if key != name})
+
+
+def _chosen(world: EditWorld, given: Any) -> list[str]:
+    """Ids of the objects of a kind."""
+    names = []
+    for name, actor in world.actors.items():
+        near = given.within_m is None or _nearest_m(world, actor) <= given.within_m
+        if given.class_ in (None, actor.label) and given.moving in (None, actor.moves) and near:
+            names.append(name)
+    if not names:
+        labels = ", ".join(sorted({actor.label for actor in world.actors.values()}))
+        raise InputError("no object is of this kind", expected=f"class among {labels or 'none'}",
+            got=str(given.model_dump(exclude_none=True, by_alias=True)))  # fmt: skip
+    return names
+
+
+def _nearest_m(world: EditWorld, actor: Actor) -> float:
+    if world.ego is None:
+        raise InputError("the vehicle's path is not known, so nothing is near it", where="within_m", remedy="give --scene")
+    apart = actor.motion.poses[:, None, :2, 3] - world.ego.poses[None, :, :2, 3]
+    return float(np.linalg.norm(apart, axis=-1).min())
+
+
+def _move(plan: EditPlan, given: Any, _: EditSources) -> None:
+    by = Displacement(given.along_m, given.left_m, given.up_m, math.radians(given.yaw_deg), given.from_s, given.ramp_s)
+    _change(plan, given.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if given.ground else None))
+
+
+def _stop(plan: EditPlan, given: Any, _: EditSources) -> None:
+    _change(plan, given.id, functools.partial(paths.stopped, at_s=given.at_s, brake_m_s2=given.brake_m_s2))
+
+
+def _speed(plan: EditPlan, given: Any, _: EditSources) -> None:
+    motion = _motion(plan.after, given.id)
+    begin = float(motion.times_s[0]) if given.from_s is None else max(given.from_s, float(motion.times_s[0]))
+    ahead = max(0.0, (given.factor - 1) * (float(motion.times_s[-1]) - begin))
+    if ahead > 0:
+        plan.notes.append({"kind": "beyond the recording", "id": given.id, "seconds": round(ahead, 3),
+                           "text": f"{given.id} goes on straight for {ahead:.1f} s of its recording that do not exist"})  # fmt: skip
+    _change(plan, given.id, functools.partial(paths.sped, factor=given.factor, from_s=given.from_s))
+
+
+def _lane_change(plan: EditPlan, given: Any, _: EditSources) -> None:
+    peak = paths.QUINTIC_PEAK * abs(given.left_m) / given.duration_s**2
+    if peak > given.most_lateral_m_s2:
+        least = math.sqrt(paths.QUINTIC_PEAK * abs(given.left_m) / given.most_lateral_m_s2)
+        raise InputError("the lane change is too sharp", where="duration_s", expected=f"at most {given.most_lateral_m_s2:g} m/s^2 sideways",
+            got=f"{peak:.2f} m/s^2 ({given.left_m:g} m in {given.duration_s:g} s)",
+            remedy=f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2")  # fmt: skip
+    plan.notes.append({"kind": "lateral acceleration", "id": given.id, "m_s2": round(peak, 3),
+                       "text": f"{given.id} changes lanes with at most {peak:.2f} m/s^2 sideways"})  # fmt: skip
+    ground = plan.after.ground if given.ground else None
+    _change(plan, given.id, functools.partial(
+        paths.lane_changed, left_m=given.left_m, start_s=given.start_s, duration_s=given.duration_s, ground=ground
+    ))  # fmt: skip
+
+
+def _path(plan: EditPlan, given: Any, _: EditSources) -> None:
+    ground = plan.after.ground if given.ground else None
+    _change(plan, given.id, functools.partial(_other_path, points=_points(given.points), ground=ground))
+
+
+def _other_path(motion: Motion, points: np.ndarray, ground: HeightMap | None) -> Motion:
+    """A path through points, at the height above the ground that the object had at first."""
+    first = motion.poses[0, :3, 3]
+    under = float("nan") if ground is None else float(ground.height(first[None, :2])[0])
+    floor = first[2] if np.isnan(under) else under
+    made = paths.along_points(points, float(first[2] - floor), ground, float(floor))
+    return replace(made, source_s=np.clip(made.times_s, motion.times_s[0], motion.times_s[-1]))
+
+
+def _points(points: list[list[float]]) -> np.ndarray:
+    made = np.full((len(points), 4), np.nan)
+    for row, point in zip(made, points, strict=True):
+        row[: len(point)] = point
+    made[:, 3] = np.radians(made[:, 3])
+    return made
+
+
+def _replace(plan: EditPlan, given: Any, sources: EditSources) -> None:
+    old, asset = _actor(plan.after, given.id), sources.asset(given.by)
+    up = Displacement(up_m=(asset.size_m[2] - old.size_m[2]) / 2)  # wheels stay where they were
+    new = Actor(asset.label, asset.size_m, paths.moved(old.motion, up))
+    if given.id in plan.before.actors and given.id not in plan.removed:
+        plan.removed.append(given.id)
+        plan.changes.pop(given.id, None)
+    plan.inserted[given.id] = Insertion(asset, 0.0, given.match_light)
+    plan.after = replace(plan.after, actors={**plan.after.actors, given.id: new})
+
+
+def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
+    asset, world = sources.asset(given.asset), plan.after
+    name = given.id or _free_name(world, given.class_ or asset.label)
+    if name in world.actors:
+        raise InputError("there is an object of this id already", where="id", got=name, remedy="give the new one another id")
+    ground = world.ground if given.ground else None
+    height = asset.size_m[2] / 2
+    if given.path is not None:
+        points = _points(given.path)
+        if len(points) == 1:
+            points = _at_all_times(points[0], world)
+        motion = paths.along_points(points, height, ground, _floor(world))
+    else:
+        motion = _near(world, given.near, height, ground)
+    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light, None if given.sun is None else _toward(given.sun))
+    plan.after = replace(world, actors={**world.actors, name: Actor(given.class_ or asset.label, asset.size_m, motion)})
+
+
+def _free_name(world: EditWorld, label: str) -> str:
+    return next(name for i in range(1, len(world.actors) + 2) if (name := f"{label}-new{i}") not in world.actors)
+
+
+def _span(world: EditWorld) -> tuple[float, float]:
+    motions = [*(actor.motion for actor in world.actors.values()), *([] if world.ego is None else [world.ego])]
+    if not motions:
+        raise InputError("the times of the drive are not known", remedy="give --scene")
+    return min(float(m.times_s[0]) for m in motions), max(float(m.times_s[-1]) for m in motions)
+
+
+def _at_all_times(point: np.ndarray, world: EditWorld) -> np.ndarray:
+    """A place with a heading, from the first to the last moment of the drive."""
+    first, last = _span(world)
+    still = np.tile(point, (2, 1))
+    still[:, 0], still[:, 3] = (first, max(last, first + 1e-3)), np.nan_to_num(point[3])
+    return still
+
+
+def _floor(world: EditWorld) -> float:
+    """Height of the ground where the map does not know it: below the vehicle, or 0."""
+    return 0.0 if world.ego is None else float(np.median(world.ego.poses[:, 2, 3]))
+
+
+def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None) -> Motion:
+    """A place relative to somebody, standing still or going with them, wheels on the ground."""
+    leader = _motion(world, given.id)
+    by = Displacement(given.ahead_m, given.left_m, 0.0, math.radians(given.yaw_deg))
+    placed = paths.moved(leader, by)
+    if given.at_s is not None:
+        pose = placed.pose_at(given.at_s)
+        if pose is None:
+            raise InputError("nobody is there at this time", where="near.at_s", got=f"{given.at_s} s",
+                expected=f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s")  # fmt: skip
+        points = np.array([[0.0, *pose[:2, 3], geometry.yaw_of(pose)]])
+        return paths.along_points(_at_all_times(points[0], world), height, ground, _floor(world))
+    yaws = np.unwrap([geometry.yaw_of(pose) for pose in placed.poses])
+    points = np.column_stack([placed.times_s, placed.poses[:, :2, 3], yaws])
+    return paths.along_points(points, height, ground, _floor(world))
+
+
+def _background(plan: EditPlan, given: Any, sources: EditSources) -> None:
+    world = plan.after
+    if world.ego is None or world.ground is None:
+        raise InputError("where the other street belongs is not known", remedy="give --scene, of a scene with classes")
+    if plan.background is not None:
+        raise InputError("there is another background already", got=given.run)
+    other = sources.background(given.run)
+    pose = place_background(world, other)
+    new = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
+    if "objects" not in given.keep:
+        for name in list(world.actors):
+            _take_away(plan, name)
+    standing = [name for name, actor in plan.after.actors.items() if name in plan.before.actors and not actor.moves]
+    for name in standing:  # it belongs to the street that is gone
+        _take_away(plan, name)
+    again = functools.partial(paths.regrounded, old=world.ground, new=new)
+    for name in list(plan.after.actors):
+        _change(plan, name, again)
+    _change(plan, EGO, again)
+    plan.background, plan.match_objects = (other, pose), given.match_light
+    plan.after = replace(plan.after, ground=new)
+    plan.notes += _seams(plan.after, new)
+
+
+def place_background(world: EditWorld, other: Background) -> np.ndarray:
+    """world_from_other f64[4, 4]: both vehicles begin at the same place and drive the same way; heights agree along the path of ours."""
+    if world.ego is None or world.ground is None:
+        raise InputError("where the other street belongs is not known", remedy="give --scene")
+    mine, theirs = (_level(motion.poses[0]) for motion in (world.ego, other.ego))
+    pose = mine @ geometry.invert(theirs)
+    xy = world.ego.poses[:, :2, 3]
+    there = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
+    pose[2, 3] += float(np.nan_to_num(np.nanmedian(np.append(world.ground.height(xy) - there.height(xy), np.nan))))
+    return pose
+
+
+def _level(pose: np.ndarray) -> np.ndarray:
+    """A pose without pitch and roll."""
+    return geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])
+
+
+def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
+    """Paths that leave the known ground of the other street."""
+    motions = {**{name: actor.motion for name, actor in world.actors.items()}, **({} if world.ego is None else {EGO: world.ego})}
+    shares = {name: float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean()) for name, motion in motions.items()}
+    off = {name: round(share, 3) for name, share in shares.items() if share > 0.05}
+    text = ", ".join(f"{name} ({share:.0%})" for name, share in off.items())
+    note = {"kind": "off the ground", "ids": list(off), "shares": off, "text": f"part of a path is off the other street's ground: {text}"}
+    return [note] if off else []
+
+
+def _sky(plan: EditPlan, given: Any, _: EditSources) -> None:
+    plan.sky = given
+
+
+_VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
+    "remove": _remove, "move": _move, "stop": _stop, "speed": _speed, "lane_change": _lane_change, "path": _path,
+    "replace": _replace, "insert": _insert, "background": _background, "sky": _sky,
+}  # fmt: skip
+
+
+# -- helpers -------------------------------------------------------------------------------------------------------------
+
+
+def _actor(world: EditWorld, name: str) -> Actor:
+    if name in world.actors:
+        return world.actors[name]
+    near = nearest(name, world.actors)
+    known = ", ".join(list(world.actors)[:20]) + (", ..." if len(world.actors) > 20 else "")
+    raise InputError("there is no object of this id", where="id", expected=f"ego, or one of {known or 'none'}", got=name,
+        remedy=f"did you mean {near!r}?" if near else "tracks.json of the scene lists them")  # fmt: skip
+
+
+def _motion(world: EditWorld, name: str) -> Motion:
+    if name != EGO:
+        return _actor(world, name).motion
+    if world.ego is None:
+        raise InputError("the path of the vehicle is not known", where="id", got=EGO, remedy="give --scene")
+    return world.ego
+
+
+def _change(plan: EditPlan, name: str, change: Change) -> None:
+    made = change(_motion(plan.after, name))
+    if name == EGO:
+        plan.after, plan.moves_ego = replace(plan.after, ego=made), True
+        return
+    if name not in plan.inserted:
+        plan.changes.setdefault(name, []).append(change)
+    plan.after = replace(plan.after, actors={**plan.after.actors, name: replace(plan.after.actors[name], motion=made)})
+
+
+def _toward(sun: Any) -> np.ndarray:
+    """Unit vector f64[3] towards the sun."""
+    azimuth, elevation = math.radians(sun.azimuth_deg), math.radians(sun.elevation_deg)
+    return np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
+
+
+def _three(size_m: Any) -> tuple[float, float, float]:
+    length, width, height = (float(value) for value in size_m)
+    return length, width, height
+
+
+# checks ---------------------------------------------------------------------------------------------------------------
+#
+# What a reader of an edited drive should know: collisions, and sides of objects that the recording hardly saw. With numbers.
+
+
+Array = NDArray[np.float64]
+STEP_S: Final = 0.1
+LEAST_OVERLAP_M: Final = 0.05
+EGO_SIZE_M: Final = (4.6, 1.9, 1.6)
+EGO_CENTRE_AHEAD_M: Final = 0.7
+"""The vehicle as a box: its size, and how far its centre lies ahead of its origin (between that of a rear axle and of a centre)."""
+FARTHEST_M: Final = 80.0
+SELDOM_RAD: Final = np.radians(30.0)
+LEAST_SHARE: Final = 0.05
+ANOTHER_SIDE_RAD: Final = np.radians(3.0)
+"""From a direction that differs by more than this, a view shows flanks that the recording may not have shown."""
+
+
+def check(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
+    """Notes of a plan and what its checks found, each with ``kind``, ids, numbers and a sentence ``text``.
+
+    Args:
+        views_before: recorded views. views_after: the same with the edited path of the vehicle.
+    """
+    return [*plan.notes, *collisions(plan), *unseen_sides(plan, views_before, views_after)]
+
+
+def collisions(plan: EditPlan) -> list[dict[str, Any]]:
+    """Pairs of boxes that overlap after the edits and did not before, over all times. Pairs that no edit touches are not tried."""
+    after, before = _with_ego(plan.after), _with_ego(plan.before)
+    touched = [*plan.touched(), *([EGO] if plan.moves_ego else [])]
+    found, done = [], set()
+    for name in touched:
+        for other in after:
+            if other == name or frozenset((name, other)) in done:
+                continue
+            done.add(frozenset((name, other)))
+            depth, at_s = _deepest(after[name], after[other])
+            known = name in before and other in before and name not in plan.inserted and other not in plan.inserted
+            if depth < LEAST_OVERLAP_M or (known and depth <= _deepest(before[name], before[other])[0] + LEAST_OVERLAP_M):
+                continue
+            found.append({
+                "kind": "collision", "ids": [name, other], "overlap_m": round(depth, 3), "at_s": round(at_s, 3),
+                "text": f"{name} and {other} overlap by {depth:.2f} m at {at_s:.2f} s",
+            })  # fmt: skip
+    return found
+
+
+def _with_ego(world: EditWorld) -> dict[str, Actor]:
+    actors = dict(world.actors)
+    if world.ego is not None:
+        to_centre = geometry.yaw_matrix(0.0, (EGO_CENTRE_AHEAD_M, 0.0, EGO_SIZE_M[2] / 2))
+        ego = world.ego
+        actors[EGO] = Actor("car", EGO_SIZE_M, Motion(ego.times_s, ego.poses @ to_centre, ego.source_s))
+    return actors
+
+
+def _deepest(a: Actor, b: Actor) -> tuple[float, float]:
+    """The deepest overlap of two boxes and its time; (-inf, 0) if they are never there together."""
+    first = max(float(a.motion.times_s[0]), float(b.motion.times_s[0]))
+    last = min(float(a.motion.times_s[-1]), float(b.motion.times_s[-1]))
+    if last < first:
+        return -np.inf, 0.0
+    times = np.linspace(first, last, max(2, int(np.ceil((last - first) / STEP_S)) + 1))
+    ends = (times[:1], times[-1:])
+    gap = [np.linalg.norm(a.motion.at(t).poses[0, :3, 3] - b.motion.at(t).poses[0, :3, 3]) for t in ends]
+    way = sum(float(actor.motion.travelled_m()[-1]) for actor in (a, b))
+    if min(gap) > way + (np.linalg.norm(a.size_m) + np.linalg.norm(b.size_m)) / 2:
+        return -np.inf, 0.0  # too far apart to meet
+    overlap = boxes.overlap_m(a.motion.at(times).poses, a.size_m, b.motion.at(times).poses, b.size_m)
+    worst = int(overlap.argmax())
+    return float(overlap[worst]), float(times[worst])
+
+
+def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
+    """Objects that the edited drive shows from directions from which the recording hardly saw them."""
+    names = list(plan.after.actors) if plan.moves_ego else plan.touched()
+    found = []
+    for name in names:
+        asked = sides_seen(plan.after.actors[name], views_after)
+        if name in plan.inserted:
+            seen = np.array(plan.inserted[name].asset.seen_rad)
+        else:
+            seen = sides_seen(plan.before.actors[name], views_before)
+        if not len(asked):
+            continue
+        if name in plan.inserted and not len(seen):
+            text = f"{name}: from which sides its own recording saw it is not known; export it with its scene"
+            found.append({"kind": "unknown sides", "ids": [name], "text": text})
+            continue
+        apart = boxes.angle_to_nearest(asked, seen)
+        share = float((apart > SELDOM_RAD).mean())
+        if share < LEAST_SHARE:
+            continue
+        largest = float(np.degrees(apart.max()))
+        found.append({
+            "kind": "seldom-seen side", "ids": [name], "share": round(share, 3), "largest_deg": round(largest, 1),
+            "text": f"{name}: {share:.0%} of its views look at sides that the recording saw from more than 30 degrees away "
+                    f"(up to {largest:.0f})" if len(seen) else f"{name}: the recording never shows it",
+        })  # fmt: skip
+    return found
+
+
+def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> set[str]:
+    """Objects of the recording of which some view shows a side that no recorded view shows, from more than `ANOTHER_SIDE_RAD` away,
+    because their path or that of the vehicle has changed."""
+    found = set()
+    for name in plan.before.actors if plan.moves_ego else plan.changes:
+        if name not in plan.before.actors or name not in plan.after.actors:
+            continue
+        asked = sides_seen(plan.after.actors[name], views_after)
+        seen = sides_seen(plan.before.actors[name], views_before)
+        if len(asked) and len(seen) and boxes.angle_to_nearest(asked, seen).max() > ANOTHER_SIDE_RAD:
+            found.add(name)
+    return found
+
+
+def sides_seen(actor: Actor, views: Sequence[View]) -> Array:
+    """From which sides views show an object, f64[M] radians from its front; views that do not have its centre in the image are left out."""
+    poses, centres = [], []
+    for view in views:
+        pose = actor.motion.pose_at(view.time_s)
+        if pose is None:
+            continue
+        uv, depth = geometry.project(view, pose[None, :3, 3])
+        if 0 < depth[0] < FARTHEST_M and 0 <= uv[0, 0] <= view.camera.width and 0 <= uv[0, 1] <= view.camera.height:
+            poses.append(pose)
+            centres.append(view.center_world)
+    return boxes.azimuths(np.stack(poses), np.stack(centres)) if poses else np.zeros(0)

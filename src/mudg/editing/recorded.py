@@ -1,0 +1,487 @@
+"""An edited scene on disk: its images, labels and LiDAR sweeps show the edits, so that every step takes it like a recorded one.
+
+Images keep their recorded pixels where a fitted scene renders the same with and without the edits; the rest comes from the render of
+the edited one. Where the vehicle drives another path or through another street all pixels do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from mudg.base import geometry, log, seeds
+from mudg.base.errors import InputError
+from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
+from mudg.base.types import Frame, FusedCloud, Observation, Photo, PointCloud, Scene, Sweep, SweepPoints, View
+from mudg.core import lidar as beams
+from mudg.core.edit import HeightMap, Motion
+from mudg.core.pictures import to_bytes
+from mudg.core.weather.lidar import SOFT, sweep_in_weather
+from mudg.diffusion.clips.condition import Vacated, VacatedAt, ray_directions
+from mudg.editing.apply import edited_cloud, edited_scene
+from mudg.editing.carried import carry_out, opener
+from mudg.editing.model import GROUND_CLASSES
+from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
+from mudg.editing.script import EditScript
+from mudg.editing.settings import EditConfig
+from mudg.editing.street import FLOOR_M, STRAY_M
+from mudg.editing.weathered import SEED, conditions_of
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points
+from mudg.scene.write import SceneWriter
+
+# swept ----------------------------------------------------------------------------------------------------------------
+#
+# LiDAR sweeps of an edited drive: beams that met what is gone go on, and meet what is new.
+#
+# The beams of a sweep are those that came back in the recording, from the place of the sensor at the sweep's time. Directions from which
+# nothing came back (the sky) are not known, so an object in front of the sky gets no returns there.
+
+
+BOX_MARGIN_M: Final = 0.1
+BEHIND_M: Final = 20.0
+"""Ground is taken to go on behind a removed object this far; what stands farther behind it is not known."""
+ON_GROUND_M: Final = 0.15
+LEAST_GROUND: Final = 10
+Rows = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class SweptCounts:
+    """What became of returns: ``cleared`` met an object that is gone; of these ``on_ground`` meet the ground behind it; ``on_objects``
+    meet an object at its new place, of which ``hidden`` had met something behind it; ``unknown`` do not come back.
+    Of those that do, ``lost`` do not in fog or rain, and ``droplets`` come from fog."""
+
+    cleared: int = 0
+    on_ground: int = 0
+    on_objects: int = 0
+    hidden: int = 0
+    unknown: int = 0
+    lost: int = 0
+    droplets: int = 0
+
+    def plus(self, other: SweptCounts) -> SweptCounts:
+        """Both together."""
+        return SweptCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+    def record(self) -> dict[str, int]:
+        """As JSON values; those of weather where there is some."""
+        return {name: value for name, value in asdict(self).items() if value or name not in ("lost", "droplets")}
+
+
+def edited_points(points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud) -> tuple[SweepPoints, SweptCounts]:
+    """The points of a sweep as the sensor would see the edited drive.
+
+    Args:
+        cloud: edited fused clouds: they hold the surfaces of objects, in the frames of their boxes.
+    """
+    xyz = points.xyz.astype(np.float64)
+    ranges = np.linalg.norm(xyz, axis=1)
+    usable = ranges > 1e-3
+    directions = xyz / np.maximum(ranges, 1e-3)[:, None]
+    cleared = np.zeros(len(xyz), bool)
+    own: dict[str, Rows] = {}
+    for name in dict.fromkeys((*plan.changes, *plan.removed)):
+        own[name] = _within(xyz, sweep, plan.before.actors[name])
+        cleared |= own[name]
+    met = np.where(cleared | ~usable, np.inf, ranges)
+    intensity, classes = points.intensity.copy(), None if points.classes is None else points.classes.copy()
+    on_ground = _beyond(directions, ranges, np.flatnonzero(cleared & usable), sweep, plan)
+    met = np.where(np.isfinite(on_ground), on_ground, met)
+    fallen = np.isfinite(on_ground)
+    intensity[fallen] = _ground_intensity(points, ranges, met[fallen], sweep, plan)
+    if classes is not None:
+        classes[fallen] = ID["road"]
+    before, taken = met.copy(), np.zeros(len(xyz), bool)
+    for name in plan.touched():
+        hit, ids = _on_object(directions, sweep, plan.after.actors[name], cloud.objects.get(name))
+        nearer = (hit < met) & usable
+        met, taken = np.where(nearer, hit, met), taken | nearer
+        intensity[nearer] = _object_intensity(points, own, name, sweep, plan)
+        if classes is not None:
+            classes[nearer] = ids[nearer]
+    back = np.isfinite(met) & np.isfinite(intensity)
+    changed = back & (fallen | taken)
+    made = points.xyz.copy()
+    made[changed] = (directions[changed] * met[changed, None]).astype(np.float32)
+    counts = SweptCounts(int(cleared.sum()), int((fallen & ~taken & back).sum()), int((taken & back).sum()),
+                         int((taken & np.isfinite(before)).sum()), int((usable & ~back).sum()))  # fmt: skip
+    kept = back | ~(usable | cleared)
+    return SweepPoints(made[kept], intensity[kept], points.dt_s[kept], None if classes is None else classes[kept]), counts
+
+
+def _pose(motion: Motion, sweep: Sweep) -> NDArray[np.float64] | None:
+    """sensor_from_box at a sweep's time."""
+    pose = motion.pose_at(sweep.time_s)
+    return None if pose is None else geometry.invert(sweep.world_from_lidar) @ pose
+
+
+def _within(xyz: NDArray[np.float64], sweep: Sweep, actor: Actor) -> Rows:
+    """Which points lie on an object: in its box, but not on the ground below it."""
+    pose = _pose(actor.motion, sweep)
+    if pose is None:
+        return np.zeros(len(xyz), bool)
+    local, half = geometry.transform_points(geometry.invert(pose), xyz), np.array(actor.size_m) / 2
+    return (np.abs(local) <= half + BOX_MARGIN_M).all(1) & (local[:, 2] > BOX_MARGIN_M - half[2])
+
+
+def _beyond(
+    directions: NDArray[np.float64], ranges: NDArray[np.float64], rows: NDArray[np.int64], sweep: Sweep, plan: EditPlan
+) -> NDArray[np.float64]:
+    """Range of the known ground behind what is gone, f64[N]; infinite where it is not known, or an object of the drive stands before it."""
+    found = np.full(len(directions), np.inf)
+    if plan.before.ground is None or not len(rows):
+        return found
+    free = beams.met_ground(directions[rows], sweep.world_from_lidar, plan.before.ground, ranges[rows], BEHIND_M)
+    for name, actor in plan.after.actors.items():
+        pose = None if name in plan.touched() else _pose(actor.motion, sweep)
+        if pose is not None:
+            free = np.where(beams.met_box(directions[rows], pose, actor.size_m) < free, np.inf, free)
+    found[rows] = free
+    return found
+
+
+def _ground_intensity(
+    points: SweepPoints, ranges: NDArray[np.float64], asked: NDArray[np.float64], sweep: Sweep, plan: EditPlan
+) -> NDArray[np.float32]:
+    """Median intensity of recorded ground at about the same range, f32; NaN where the sweep shows no ground."""
+    if plan.before.ground is None or not len(asked):
+        return np.zeros(0, np.float32)
+    world = geometry.transform_points(sweep.world_from_lidar, points.xyz.astype(np.float64))
+    with np.errstate(invalid="ignore"):
+        low = np.abs(world[:, 2] - plan.before.ground.height(world[:, :2])) < ON_GROUND_M
+    if not low.any():
+        return np.full(len(asked), np.nan, np.float32)
+    order = np.argsort(ranges[low], kind="stable")
+    far, value = ranges[low][order], points.intensity[low][order]
+    made = []
+    for wanted in asked:
+        first, last = np.searchsorted(far, (0.8 * wanted, 1.25 * wanted))
+        made.append(np.median(value[first:last] if last - first >= LEAST_GROUND else value))
+    return np.array(made, np.float32)
+
+
+def _on_object(
+    directions: NDArray[np.float64], sweep: Sweep, actor: Actor, surface: PointCloud | None
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Range at which beams meet an object, f64[N] (infinite: they miss it), and the class there u8[N]. Without points: those of its box."""
+    hit = np.full(len(directions), np.inf)
+    kind = ID.get(actor.label, UNLABELLED)
+    ids = np.full(len(directions), kind, np.uint8)
+    pose = _pose(actor.motion, sweep)
+    if pose is None:
+        return hit, ids
+    around = beams.met_box(directions, pose, np.array(actor.size_m) + 2 * beams.LARGEST_M)
+    rows = np.flatnonzero(np.isfinite(around))
+    if surface is None or not len(surface.xyz):
+        hit[rows] = beams.met_box(directions[rows], pose, actor.size_m)
+        return hit, ids
+    own = surface.xyz.astype(np.float64)
+    hit[rows], first = beams.met_points(directions[rows], geometry.transform_points(pose, own), beams.ball_sizes(own))
+    if surface.semantics is not None:
+        ids[rows] = np.where(first >= 0, surface.semantics[first], kind)
+    return hit, ids
+
+
+def _object_intensity(points: SweepPoints, own: Mapping[str, Rows], name: str, sweep: Sweep, plan: EditPlan) -> float:
+    """Median intensity of an object's recorded returns; of a new one: of what else lies in boxes of this sweep, else of all of it."""
+    mine = own.get(name)
+    if mine is not None and mine.any():
+        return float(np.median(points.intensity[mine]))
+    xyz = points.xyz.astype(np.float64)
+    boxes = [_within(xyz, sweep, actor) for actor in plan.before.actors.values()]
+    all_boxes = np.any(boxes, axis=0) if boxes else np.zeros(len(xyz), bool)
+    chosen = points.intensity[all_boxes] if all_boxes.any() else points.intensity
+    return float(np.median(chosen)) if len(chosen) else float("nan")
+
+
+# vacated --------------------------------------------------------------------------------------------------------------
+#
+# Where recorded photographs do not show an edited drive: the boxes of what was removed, moved or put in, and the ground about them.
+#
+# The ground about a box holds its shadow. The direction of the sun is not known on a recorded log, so as much as the box is high counts
+# on
+# every side: other photographs show that ground without it.
+
+
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Pose world_from_box f64[4, 4] and size f64[3] in metres."""
+Boxes = Sequence[Box]
+SHADOW_REACH: Final = 1.0
+"""Shadows are looked for this far about a box, as a share of its height."""
+SLAB_M: Final = 0.1
+"""Thickness of the ground about a box that is drawn."""
+BOX_GROWTH_M: Final = 0.2
+SAME_M: Final = 1e-3
+FARTHEST_GROUND_M: Final = 80.0
+"""Nothing is known of how the ground goes on farther away."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveOfEdits:
+    """A drive as the diffusion model is to see it: what was planned, the edited scene, clouds and fit (None where there is none)."""
+
+    plan: EditPlan
+    scene: Scene
+    cloud: FusedCloud
+    model: SceneModel | None
+
+
+def drive_of_edits(script: EditScript, scene: Scene, cloud: FusedCloud, model: SceneModel | None, *, told: bool = False) -> DriveOfEdits:
+    """Carry out a script on a scene and its clouds, and on its fit where there is one.
+
+    Args:
+        told: warn of what the script says and the conditions do not show.
+
+    Raises:
+        InputError: something in the script that cannot be done here.
+    """
+    if told and conditions_of(script.canonical()) is not None:
+        log.info("generated views show no weather and light (that takes --fitted and a published-type model); `mudg render` does")
+    if model is not None:
+        drive = carry_out(script, model, scene, cloud)
+        return DriveOfEdits(drive.plan, drive.scene or scene, cleared_cloud(drive.cloud or cloud, drive.plan), drive.model(model))
+    xyz = cloud.static.xyz
+    xyz = xyz[:0] if cloud.static.semantics is None else xyz[np.isin(cloud.static.semantics, GROUND_CLASSES)]
+    world = EditWorld.of_scene(scene, HeightMap.from_points(xyz) if len(xyz) else None)
+    plan = plan_edits(script, world, EditSources(opener(script), _no_background))
+    return DriveOfEdits(plan, edited_scene(scene, plan), cleared_cloud(edited_cloud(cloud, plan), plan), None)
+
+
+def _no_background(name: str) -> Background:
+    raise InputError("points alone cannot get another background", where="run", got=name, remedy="give a fit (--fitted)")
+
+
+def photos_of_edited(photos: Iterable[Photo], plan: EditPlan) -> list[Photo]:
+    """Recorded photographs with the pixels marked that do not show the edited drive."""
+    return [replace(photo, usable=_usable(photo, plan)) for photo in photos]
+
+
+def _usable(photo: Photo, plan: EditPlan) -> NDArray[np.bool_] | None:
+    height, width = photo.rgb.shape[:2]
+    view = photo.view if photo.view.camera.width == width else photo.view.resized(width, height)
+    touched = [box for when in ("before", "after") for box in touched_boxes(plan, photo.view.time_s, when)]
+    covered = _hidden_by(view, touched, plan)
+    usable = ~covered if photo.usable is None else photo.usable & ~covered
+    return None if usable.all() else usable
+
+
+def _hidden_by(view: View, boxes: Boxes, plan: EditPlan) -> NDArray[np.bool_]:
+    """Bool[H, W]: inside the outlines of boxes or on the ground about them, but not where another moving object stands in front, nor on
+    that ground where one stands anywhere."""
+    if not boxes:
+        return np.zeros((view.camera.height, view.camera.width), bool)
+    ahead = lambda box: float((view.cam_from_world @ box[0])[2, 3])  # noqa: E731
+    rest, nearest = others(plan, view.time_s), min(map(ahead, boxes))
+    covered = boxes_mask(view, boxes) | (ground_mask(view, boxes) & ~boxes_mask(view, rest))
+    return covered & ~boxes_mask(view, [box for box in rest if ahead(box) < nearest])
+
+
+def touched_boxes(plan: EditPlan, time_s: float, when: str) -> list[Box]:
+    """Poses world_from_box f64[4, 4] and sizes f64[3] of what a plan removes, moves or puts in, where it is not the same at this time
+    `before` and `after` the edits. An object on its recorded place is left out."""
+    found = []
+    for name in dict.fromkeys((*plan.removed, *plan.changes, *plan.inserted)):
+        old, new = (_pose_vacated(world.actors.get(name), time_s) for world in (plan.before, plan.after))
+        kept = name in plan.changes and name not in plan.inserted
+        if kept and old is not None and new is not None and np.abs(old - new).max() < SAME_M:
+            continue
+        actor, pose = (plan.before.actors.get(name), old) if when == "before" else (plan.after.actors.get(name), new)
+        if actor is not None and pose is not None:
+            found.append((pose, np.asarray(actor.size_m, np.float64)))
+    return found
+
+
+def vacated_at(plan: EditPlan) -> VacatedAt:
+    """Where, in a view of the edited drive, something stood in the recording and stands no more, its shadow included."""
+
+    def found(view: View) -> Vacated:
+        before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
+        shown = boxes_mask(view, after)
+        mask = _hidden_by(view, before, plan) & ~shown
+        ground = np.full(mask.shape, np.nan, np.float32)
+        for pose, size in before:
+            depth = _plane_depth(view, pose, size)
+            ground = np.where(boxes_mask(view, [(pose, size)]) | ground_mask(view, [(pose, size)]), np.fmin(ground, depth), ground)
+        stood = mask & boxes_mask(view, before)
+        return Vacated(*(torch.from_numpy(plane) for plane in (mask, ground, shown, stood)))
+
+    return found
+
+
+def _plane_depth(view: View, pose: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Depth f32[H, W] of the plane below a box, NaN where the ray does not meet it within `FARTHEST_GROUND_M`."""
+    rays = np.stack([axis.numpy() for axis in ray_directions(view)], -1).astype(np.float64)
+    normal, foot = pose[:3, 2], pose[:3, 3] - pose[:3, 2] * size[2] / 2
+    falls = rays @ normal
+    depth = np.where(falls < -1e-4, (foot - view.center_world) @ normal / np.minimum(falls, -1e-4), np.nan)
+    return np.where((depth > 0) & (depth < FARTHEST_GROUND_M), depth, np.nan).astype(np.float32)
+
+
+def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
+    """Edited clouds without what boxes that were too small left behind of removed and moved objects along their recorded paths: static
+    points in the grown boxes that are not ground."""
+    static = cloud.static
+    stray = np.zeros(len(static), bool)
+    low_of = np.zeros(len(static), bool) if static.semantics is None else np.isin(static.semantics, GROUND_CLASSES)
+    for name in dict.fromkeys((*plan.removed, *plan.changes)):
+        actor = plan.before.actors[name]
+        for pose in actor.motion.poses if actor.moves else ():
+            local = geometry.transform_points(geometry.invert(pose), static.xyz.astype(np.float64))
+            half = np.asarray(actor.size_m) / 2
+            inside = (np.abs(local[:, :2]) <= half[:2] + STRAY_M).all(1) & (local[:, 2] <= half[2] + STRAY_M)
+            stray |= inside & (local[:, 2] > FLOOR_M - half[2])
+    kept = ~(stray & ~low_of)
+    part = lambda values: None if values is None else values[kept]  # noqa: E731
+    return replace(cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=part(static.semantics)))
+
+
+def others(plan: EditPlan, time_s: float) -> list[Box]:
+    """Poses and sizes of the moving objects that a plan leaves alone."""
+    touched = {*plan.removed, *plan.changes, *plan.inserted}
+    found = [(actor, _pose_vacated(actor, time_s)) for name, actor in plan.after.actors.items() if name not in touched and actor.moves]
+    return [(pose, np.asarray(actor.size_m, np.float64)) for actor, pose in found if pose is not None]
+
+
+def _pose_vacated(actor: Actor | None, time_s: float) -> NDArray[np.float64] | None:
+    return None if actor is None else actor.motion.pose_at(time_s)
+
+
+def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
+    """Bool[H, W]: inside the outline of a box, grown a little."""
+    return outlines(view, [(pose, size + BOX_GROWTH_M) for pose, size in boxes])
+
+
+def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArray[np.bool_]:
+    """Bool[H, W]: ground below and about a box, as far as `reach` times its height, where its shadow may lie; what stands there is not
+    told apart."""
+    slabs = []
+    for pose, size in boxes:
+        about_m = 2 * reach * size[2]
+        flat = pose @ geometry.yaw_matrix(0.0, (0.0, 0.0, -size[2] / 2))
+        slabs.append((flat, np.array([size[0] + about_m, size[1] + about_m, SLAB_M])))
+    return outlines(view, slabs)
+
+
+def outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
+    """Bool[H, W]: inside the outline of a box."""
+    covered = np.zeros((view.camera.height, view.camera.width), bool)
+    for pose, size in boxes:
+        hull = geometry.box_hull(view, pose, size)  # of what lies ahead: a box beside the camera does not cover the whole image
+        if hull is not None:
+            canvas = Image.new("1", (view.camera.width, view.camera.height))
+            outline = [(float(x), float(y)) for x, y in hull.points[hull.vertices] - 0.5]
+            ImageDraw.Draw(canvas).polygon(outline, fill=1, outline=1)
+            covered |= np.array(canvas, bool)
+    return covered
+
+
+# written --------------------------------------------------------------------------------------------------------------
+
+
+NOTE: Final = "edited: parts of the images are renders of a fitted scene"
+CHANGED_ABOVE: Final = 4 / 255
+"""Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as recorded or rendered."""
+GROWN_PX: Final = 2
+"""The rest is grown by this much: a render fades out beyond what differs clearly."""
+KEPT_LABELS: Final = ("semantics", "depth", "sky", "dynamic")
+"""Labels that a changed image keeps; others speak of the recording."""
+RENDERED: Final = "rendered"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditedImages:
+    """Makes images of an edited drive.
+
+    Args:
+        before, after: a fitted scene without and with the edits.
+        whole: every pixel is rendered: the vehicle drives another path, or through another street.
+    """
+
+    before: SceneModel
+    after: SceneModel
+    config: EditConfig
+    whole: bool
+    repaired: Mapping[str, Iterator[Observation]] | None = None
+    """By camera: views of its frames in order, repaired by a diffusion model."""
+
+    def of(self, recorded: NDArray[np.uint8], frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Observation]:
+        """The image u8[H, W, 3] of a frame, which of its pixels [H, W] are rendered, and the render."""
+        raster = raster_of(self.before, self.config.raster)
+        made = render_view(self.after, frame.view, raster) if self.repaired is None else next(self.repaired[frame.view.camera.name])
+        if self.whole:
+            return to_bytes(made.rgb), np.ones(recorded.shape[:2], bool), made
+        usual = render_view(self.before, frame.view, raster)
+        changed = ((made.rgb - usual.rgb).abs().amax(0) > CHANGED_ABOVE).numpy()
+        changed = np.asarray(ndimage.binary_dilation(changed, iterations=GROWN_PX), bool) if changed.any() else changed
+        return np.where(changed[..., None], to_bytes(made.rgb), recorded), changed, made
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveChange:
+    """What is to be written.
+
+    Args:
+        plan: what was done. scene: with the edited boxes, path and poses (``apply.edited_scene``). cloud: edited.
+    """
+
+    plan: EditPlan
+    scene: Scene
+    cloud: FusedCloud
+
+
+def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, root: Path) -> SweptCounts:
+    """Write a scene whose files show the edits; returns what became of LiDAR returns.
+
+    Args:
+        scene: as recorded.
+    """
+    edited, counts = drive.scene, SweptCounts()
+    source = replace(scene.source, recipe=None, notes=(*scene.source.notes, NOTE))
+    with SceneWriter(root, scene.id, source) as writer:
+        for camera in scene.cameras.values():
+            writer.add_camera(camera)
+        for number, sweep in enumerate(scene.sweeps if drive.plan.background is None else ()):  # another street was not measured from here
+            points, became = edited_points(read_points(scene, sweep), sweep, drive.plan, drive.cloud)
+            if drive.plan.weather_of_beams is not None:
+                there, seed = len(points.xyz), seeds.key(SEED, number, "LiDAR in weather")
+                points, kinds = sweep_in_weather(points, drive.plan.weather_of_beams, seed)
+                became = replace(became, lost=there - len(kinds), droplets=int((kinds == SOFT).sum()))
+            counts = counts.plus(became)
+            writer.add_sweep(sweep.id, sweep.sensor, sweep.time_s, sweep.world_from_lidar, points)
+        for track in edited.tracks:
+            writer.add_track(track)
+        writer.set_ego(edited.ego)
+        writer.set_split(scene.split)
+        for old, new in log.progress(list(zip(scene.frames, edited.frames, strict=True)), len(scene.frames), "editing images"):
+            image, changed, made = images.of(read_image(scene, old), new)
+            if not changed.any():
+                writer.copy_frame(scene, old)
+            else:
+                writer.add_frame(new.id, new.view, image, _labels(scene, old, changed, made))
+        writer.finish()
+    return counts
+
+
+def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], made: Observation) -> dict[str, NDArray[Any]]:
+    """Labels of a changed image: those of the render where it is rendered."""
+    found = {name: read_label(scene, frame, name) for name in KEPT_LABELS if name in frame.labels}
+    ours = {RENDERED: changed | read_label(scene, frame, RENDERED) if RENDERED in frame.labels else changed}
+    if made.semantics is None or made.depth is None:
+        return ours
+    ids = made.semantics.numpy().astype(np.uint8)
+    rendered = {
+        "semantics": ids, "sky": ids == ID["sky"], "dynamic": np.isin(ids, DYNAMIC_IDS),
+        "depth": np.nan_to_num(made.depth[0].numpy(), nan=np.inf),
+    }  # fmt: skip
+    return ours | {name: np.where(changed, rendered[name].astype(old.dtype), old) for name, old in found.items()}

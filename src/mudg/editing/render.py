@@ -1,0 +1,246 @@
+"""render: a fitted scene on recorded and shifted trajectories -> observation folders and videos.
+
+    OUT/<trajectory>/    observations (see scene/observations.py)
+    OUT/<trajectory>.mp4 colour, depth, semantics side by side
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from mudg import native
+from mudg.base import log, memory
+from mudg.base.devices import choose_device, memory_of
+from mudg.base.errors import UsageError
+from mudg.base.palette import CLASSES
+from mudg.base.processes import computed_ahead
+from mudg.base.types import Observation, Scene, Trajectory, View
+from mudg.baselines.emernerf.fit import load_field, observe
+from mudg.core import trajectory
+from mudg.core.pictures import panels_of, side_by_side
+from mudg.core.raster.place import drawing_device
+from mudg.diffusion.clips.inputs import InWeather
+from mudg.editing.apply import scene_seen_by
+from mudg.editing.carried import FACT, EditedDrive, carry_out
+from mudg.editing.harmonised import (
+    EditedSources,
+    Harmoniser,
+    RepairedViews,
+    WeatherHarmoniser,
+    check_paths,
+    harmonises_weather,
+)
+from mudg.editing.script import EditScript
+from mudg.editing.view_settings import RenderConfig
+from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.formats.exporters.video import write_mp4
+from mudg.gaussians.fit import load_model, render_view
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of
+from mudg.gaussians.storage import RADIANCE, kind_of
+from mudg.gaussians.views import resized_view
+from mudg.scene.clouds import read_fused
+from mudg.scene.observations import ObservationWriter, read_observations
+from mudg.scene.read import read_scene
+
+VIEW_BYTES: Final = 4 * (3 + 1 + 1 + len(CLASSES))
+"""Bytes per pixel that drawing a view needs at least: colour, depth, coverage and shares of the classes."""
+AHEAD_PIXELS: Final = 1_000_000
+VIDEO_FPS: Final = 10.0
+"""Larger views are drawn one at a time by all threads: less memory."""
+Drawers = Callable[[Sequence[View]], AbstractContextManager[Iterator[Observation]]]
+"""Draws views in order."""
+
+
+Edited = tuple[Scene, SceneModel, EditedDrive | None]
+"""Scene and fit as they are rendered, and what an edit script did to them."""
+
+
+def prepare(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None) -> Edited | None:
+    """Carry out the edit script, if there is one: what cannot be done is told before anything is written.
+
+    Args:
+        fused: fused clouds of the scene, for ``config.harmonize``.
+    """
+    radiance = kind_of(model) == RADIANCE
+    if radiance and (config.remove_tracks or script is not None):
+        raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
+            remedy="leave --remove-tracks and --edits out")  # fmt: skip
+    choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
+    edited = None if script is None else _edited(scene, model, script, fused if config.harmonize.on else None)
+    if edited is not None and config.harmonize.on:
+        check_paths(config.harmonize, {path.name: len(path) for path in trajectories(edited[0], config)})
+    return edited
+
+
+def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, out: Path) -> dict[str, Any]:
+    """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a summary. An
+    interrupted run continues with the next missing view.
+
+    Args:
+        scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare`` made of them.
+    """
+    followers = list[RepairedViews]()
+    if kind_of(model) == RADIANCE:
+        device = choose_device(config.device, "render")
+        loaded, (draw, source) = read_scene(scene), _field_drawer(config, model, device)
+    else:
+        device = drawing_device(config.device, "render", config.raster)
+        loaded, fitted, drive = edited or _edited(scene, model, None)
+        draw, source = _scene_drawer(config, fitted.to(device))
+        if config.harmonize.on and drive is not None:
+            draw = _repaired(config, (drive, fitted), (scene, model), draw)
+            followers.append(draw)
+        conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
+        if conditions is not None:
+            how = weather_of(draw, conditions, loaded)
+            draw = in_weather(draw, how)
+            if config.harmonize.on and drive is not None and harmonises_weather(config.harmonize, how):
+                draw = _corrected(config, (drive, fitted), scene, (draw, how))
+                followers.append(draw)
+    paths = trajectories(loaded, config)
+    _require_memory(paths)
+    threads = 1 if followers or device.type != "cpu" else native.threads()
+    with (
+        log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
+        memory_of(device, "render"), ThreadPoolExecutor(1) as encoder,
+    ):  # fmt: skip
+        videos = list[Future[None]]()
+        for path in paths:
+            for follower in followers:
+                follower.follow(path)
+            _render_trajectory(_several(draw, threads), path, out / path.name, source, bar)
+            if config.video:
+                videos.append(encoder.submit(_write_video, out / path.name, out / f"{path.name}.mp4", VIDEO_FPS))
+        for video in videos:
+            video.result()
+    return {"trajectories": [path.name for path in paths], "views": sum(len(path) for path in paths)}
+
+
+def _require_memory(paths: Sequence[Trajectory]) -> None:
+    """ResourceError where one view of a trajectory cannot fit into memory."""
+    camera = max((view.camera for path in paths for view in path.views), key=lambda one: one.width * one.height)
+    pixels, asked = camera.width * camera.height, f"a view of {camera.width} x {camera.height} pixels"
+    memory.require(pixels * VIEW_BYTES, asked, "smaller views (--width-px)")
+
+
+def _edited(
+    scene: Path, model: Path, script: EditScript | None, fused: Path | None = None
+) -> tuple[Scene, SceneModel, EditedDrive | None]:
+    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script; and what it did."""
+    fitted = load_model(Path(model))
+    loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
+    if script is None:
+        return loaded, fitted, None
+    drive = carry_out(script, fitted, loaded, None if fused is None else read_fused(Path(fused)))
+    return drive.scene or loaded, drive.model(fitted), drive
+
+
+def _repaired(
+    config: RenderConfig, edited: tuple[EditedDrive, SceneModel], given: tuple[Path, Path], draw: Drawer
+) -> RepairedViews:
+    """What draws views with the touched pixels repaired.
+
+    Args:
+        edited: what was done, and the edited fit. given: folders of scene and fit, as they are without the edits.
+    """
+    (drive, fitted), (scene, model) = edited, given
+    before = load_model(model)
+    recorded, (usual, _) = scene_seen_by(read_scene(scene), before.facts), _scene_drawer(config, before.to(fitted.device))
+    camera = trajectories(recorded, config)[0].views[0].camera
+    harmoniser = Harmoniser(EditedSources.of(drive, fitted, recorded), config.harmonize, (camera.width, camera.height), config.device)
+    return RepairedViews(harmoniser, lambda view: (usual(view), draw(view)))
+
+
+def _corrected(
+    config: RenderConfig, edited: tuple[EditedDrive, SceneModel], scene: Path, drawn: tuple[Drawer, InWeather]
+) -> RepairedViews:
+    """What draws views in other weather, corrected by the diffusion model; ``drawn``: what draws them by the formulas."""
+    (drive, fitted), (draw, how) = edited, drawn
+    recorded = scene_seen_by(read_scene(scene), fitted.facts)
+    camera = trajectories(recorded, config)[0].views[0].camera
+    sources = EditedSources.of(drive, fitted, recorded)
+    harmoniser = WeatherHarmoniser(sources, how, config.harmonize, (camera.width, camera.height), config.device)
+
+    def pair(view: View) -> tuple[Observation, Observation]:
+        made = draw(view)
+        return made, made
+
+    return RepairedViews(harmoniser, pair)
+
+
+def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
+    """What draws the views of a scene of Gaussians, and its name."""
+    if config.remove_tracks:
+        fitted = fitted.without_nodes(config.remove_tracks)
+    source, raster = str(fitted.facts.get("method", "fit")), raster_of(fitted, config.raster)
+    return lambda view: render_view(fitted, view, raster, source), source
+
+
+def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tuple[Drawer, str]:
+    """What draws the views of a radiance field, and its name."""
+    field, budget = load_field(model)
+    source = str(field.facts.get("method", "fit"))
+    return functools.partial(
+        observe, field.to(device), budget=budget, source=source
+    ), source
+
+
+def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
+    """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path.
+
+    Raises:
+        UsageError: an unknown camera, or nothing to render.
+    """
+    cameras = config.cameras or tuple(scene.cameras)[:1]
+    if not config.shifts_m and not config.paths:
+        raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
+    paths = []
+    for camera in cameras:
+        found = [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
+        for path in (*found, *(trajectory.named(scene, camera, name) for name in config.paths)):
+            paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
+    return tuple(paths)
+
+
+def _several(draw: Drawer, threads: int) -> Drawers:
+    """What draws views in order; small ones beforehand, in as many threads, so that a thread draws while another writes."""
+
+    def drawn(views: Sequence[View]) -> Generator[Observation, None, None]:
+        if threads == 1 or any(view.camera.width * view.camera.height > AHEAD_PIXELS for view in views):
+            yield from map(draw, views)
+            return
+        with native.one_thread():
+            yield from computed_ahead(lambda number: draw(views[number]), len(views), threads)
+
+    return lambda views: closing(drawn(views))
+
+
+def _render_trajectory(draw: Drawers, path: Trajectory, out: Path, source: str, bar: log.ProgressTask) -> None:
+    """One folder of observations; views that an earlier, interrupted run wrote are kept."""
+    if (out / "observations.json").is_file():
+        bar.advance(len(path))
+        return
+    with ObservationWriter(out, path.name, source) as writer:
+        kept = path.views[: writer.done]
+        for view in kept:
+            writer.skip(view)
+            bar.advance()
+        with draw(path.views[len(kept) :]) as made:
+            for observation in made:
+                writer.add(observation)
+                bar.advance()
+
+
+def _write_video(observations: Path, path: Path, fps: float) -> None:
+    if path.is_file():
+        return
+    views = read_observations(observations)
+    write_mp4(path, (side_by_side(panels_of(views[index])) for index in range(len(views))), fps)

@@ -1,0 +1,387 @@
+"""Reading edit scripts: a list of verbs, each with its settings. What is wrong is told with file, line, verb and field."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Self
+
+import yaml
+from pydantic import AfterValidator, Field, ValidationError, model_validator
+
+from mudg.base import store
+from mudg.base.errors import InputError, nearest, short
+from mudg.base.plain_yaml import Lines, parse_with_lines
+from mudg.base.records import Number, StrictRecord, after, checked_by, first_problem, place
+from mudg.base.weather_settings import LightSettings, SeasonSettings, WeatherSettings
+
+# records --------------------------------------------------------------------------------------------------------------
+#
+# What each verb of an edit script says. Distances in metres, times in seconds on the scene's clock, angles in degrees.
+
+
+EGO: Final = "ego"
+"""The id of the recording vehicle in edit scripts."""
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+def _named(value: str) -> str:
+    if not value.strip():
+        raise InputError("an id is empty", expected="the id of a track", got=repr(value))
+    return value
+
+
+Name = Annotated[str, after(_named)]
+
+
+def _not_ego(value: str) -> str:
+    if value == EGO:
+        raise InputError("the recording vehicle cannot be edited so", expected="the id of a track", got=EGO,
+            remedy="ego takes lane_change, speed, stop, move and path")  # fmt: skip
+    return value
+
+
+ActorName = Annotated[str, after(_named), after(_not_ego)]
+
+
+class AssetSource(StrictRecord):
+    """Where an object comes from: a fitted scene (``run`` and ``id``) or an asset ``file``. Paths are relative to the script."""
+
+    run: Name | None = None
+    id: Name | None = None
+    file: Name | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.file is None) == (self.run is None) or (self.run is None) != (self.id is None):
+            checked_by(_refuse_source)(self)
+        return self
+
+
+def _refuse_source(source: AssetSource) -> None:
+    given = [name for name in ("run", "id", "file") if getattr(source, name) is not None]
+    raise InputError("it is not clear where the object comes from", expected="run and id, or file alone",
+        got=" and ".join(given) or "none of them")  # fmt: skip
+
+
+class RemoveEdit(StrictRecord):
+    """Take objects away: those of ``ids``, or those of a ``class``, all or only ``moving`` ones, all or near the vehicle's path."""
+
+    ids: Annotated[list[ActorName], Field(min_length=1)] | None = None
+    class_: Name | None = Field(default=None, alias="class")
+    moving: bool | None = None
+    within_m: Positive | None = None
+    close_street: bool | None = None
+
+    @model_validator(mode="after")
+    def _either(self) -> Self:
+        by_kind = self.class_ is not None or self.moving is not None or self.within_m is not None
+        if (self.ids is None) != by_kind:
+            checked_by(_refuse_selection)(by_kind)
+        return self
+
+
+def _refuse_selection(both: bool) -> None:
+    raise InputError("objects are chosen by ids or by kind", expected="ids, or any of class, moving, within_m",
+        got="both" if both else "nothing")  # fmt: skip
+
+
+class MoveEdit(StrictRecord):
+    """Displace an object in its own frame, for good or from a moment on."""
+
+    id: Name
+    along_m: Number = 0.0
+    left_m: Number = 0.0
+    up_m: Number = 0.0
+    yaw_deg: Number = 0.0
+    from_s: Number | None = None
+    ramp_s: NotNegative = 1.0
+    ground: bool = True
+    close_street: bool | None = None
+    close_sides: bool = True
+
+
+class StopEdit(StrictRecord):
+    """Brake evenly, and stand from then on."""
+
+    id: Name
+    at_s: Number
+    brake_m_s2: Annotated[float, Field(gt=0, le=12)] = 4.0
+    close_street: bool | None = None
+    close_sides: bool = True
+
+
+class SpeedEdit(StrictRecord):
+    """Drive the same path faster or slower."""
+
+    id: Name
+    factor: Annotated[float, Field(gt=0, le=5)]
+    from_s: Number | None = None
+    close_street: bool | None = None
+    close_sides: bool = True
+
+
+class LaneChangeEdit(StrictRecord):
+    """Change lanes, smoothly."""
+
+    id: Name
+    left_m: Number
+    start_s: Number
+    duration_s: Positive
+    most_lateral_m_s2: Positive = 4.0
+    ground: bool = True
+    close_street: bool | None = None
+    close_sides: bool = True
+
+
+def _path_points(points: list[list[float]]) -> list[list[float]]:
+    for index, point in enumerate(points):
+        if len(point) not in (3, 4):
+            raise InputError("a point of a path has the wrong length", where=f"[{index}]", expected="[t, x, y] or [t, x, y, yaw_deg]",
+                got=str(point)[:80])  # fmt: skip
+        if index and point[0] <= points[index - 1][0]:
+            raise InputError("the times of a path do not increase", where=f"[{index}]", expected=f"more than {points[index - 1][0]} s",
+                got=f"{point[0]} s")  # fmt: skip
+    if len({len(point) for point in points}) > 1:
+        raise InputError("some points of a path have a yaw and others have none", expected="all or none")
+    return points
+
+
+Points = Annotated[list[list[Number]], Field(min_length=1), AfterValidator(checked_by(_path_points))]
+
+
+class PathEdit(StrictRecord):
+    """Drive another path: points [t, x, y, yaw_deg] or [t, x, y] in the world."""
+
+    id: Name
+    points: Points
+    ground: bool = True
+    close_street: bool | None = None
+    close_sides: bool = True
+
+    @model_validator(mode="after")
+    def _drives(self) -> Self:
+        if len(self.points) < 2:
+            checked_by(_refuse_point)(self.points)
+        return self
+
+
+def _refuse_point(points: list[list[float]]) -> None:
+    raise InputError("a path needs two points", where="points", got=str(points))
+
+
+class ReplaceEdit(StrictRecord):
+    """Put another object in the place of one."""
+
+    id: ActorName
+    by: AssetSource
+    match_light: bool = True
+
+
+class PlaceNear(StrictRecord):
+    """A place relative to the vehicle or to an object: where that is at ``at_s``, or with it all the time."""
+
+    id: Name = EGO
+    at_s: Number | None = None
+    ahead_m: Number = 0.0
+    left_m: Number = 0.0
+    yaw_deg: Number = 0.0
+
+
+class SunPlace(StrictRecord):
+    """Where the recorded sun stands: degrees counter-clockwise from world x, and above the horizon."""
+
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)]
+    elevation_deg: Annotated[float, Field(ge=10, le=90)]
+
+
+class InsertEdit(StrictRecord):
+    """Add an object, on a ``path`` or ``near`` something; with ``sun``, its shadow lies where that casts it."""
+
+    asset: AssetSource
+    id: ActorName | None = None
+    class_: Name | None = Field(default=None, alias="class")
+    path: Points | None = None
+    near: PlaceNear | None = None
+    ground: bool = True
+    shadow: Share = 0.6
+    sun: SunPlace | None = None
+    match_light: bool = True
+
+    @model_validator(mode="after")
+    def _placed(self) -> Self:
+        if (self.path is None) == (self.near is None):
+            checked_by(_refuse_place)(self)
+        return self
+
+
+def _refuse_place(edit: InsertEdit) -> None:
+    raise InputError("an object to insert needs one place", expected="path or near", got="both" if edit.path else "neither")
+
+
+def _with_ego(keep: list[str]) -> list[str]:
+    if "ego" not in keep:
+        raise InputError("the vehicle keeps its own path", expected="[objects, ego] or [ego]", got=str(keep))
+    return keep
+
+
+class BackgroundEdit(StrictRecord):
+    """Another street around the vehicle and the moving objects of this one: that of a folder of ``mudg run``."""
+
+    run: Name
+    keep: Annotated[list[Literal["objects", "ego"]], Field(min_length=1), after(_with_ego)] = Field(
+        default_factory=lambda: ["objects", "ego"]
+    )
+    match_light: bool = True
+
+
+class SkyEdit(StrictRecord):
+    """Another sky: a panorama of all directions (longitude across, zenith at the top), turned to the left by ``yaw_deg``."""
+
+    image: Name
+    yaw_deg: Number = 0.0
+
+
+VERBS: Final[dict[str, type[StrictRecord]]] = {
+    "remove": RemoveEdit, "move": MoveEdit, "stop": StopEdit, "speed": SpeedEdit, "lane_change": LaneChangeEdit, "path": PathEdit,
+    "replace": ReplaceEdit, "insert": InsertEdit, "background": BackgroundEdit, "sky": SkyEdit,
+    "weather": WeatherSettings, "light": LightSettings, "season": SeasonSettings,
+}  # fmt: skip
+CONDITIONS: Final = ("weather", "light", "season")
+"""Verbs that change no geometry."""
+
+
+def files_of(edit: Any) -> list[str]:
+    """Paths that an edit names, as written."""
+    source = getattr(edit, "asset", None) or getattr(edit, "by", None)
+    named = [source.run or source.file] if source is not None else []
+    return named + [value for name in ("run", "image") if isinstance(value := getattr(edit, name, None), str)]
+
+
+# script ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ScriptEdit:
+    """One entry of a script: its verb, its settings (the record of `VERBS`), and where it stands."""
+
+    verb: str
+    settings: Any
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class EditScript:
+    """A checked script.
+
+    Args:
+        edits: in the order in which they apply.
+        folder: what relative paths in it are relative to.
+    """
+
+    edits: tuple[ScriptEdit, ...]
+    folder: Path
+
+    def path_of(self, name: str) -> Path:
+        """A file or folder that the script names."""
+        return self.folder / name
+
+    def files(self) -> dict[str, Path]:
+        """Every file or folder that the script reads, by the name it has there."""
+        return {name: self.path_of(name) for edit in self.edits for name in files_of(edit.settings)}
+
+    def canonical(self) -> list[dict[str, Any]]:
+        """The script as JSON values with all defaults: two scripts that say the same are equal here."""
+        return [{edit.verb: edit.settings.model_dump(mode="json", by_alias=True)} for edit in self.edits]
+
+    def digest(self) -> str:
+        """Hash of what the script says and of what it reads; part of the key of everything made with it.
+
+        Raises:
+            InputError: a file or folder that it names does not exist. IntegrityError: one was altered.
+        """
+        contents = {}
+        for edit in self.edits:
+            for name in files_of(edit.settings):
+                try:
+                    contents[name] = store.digest(self.path_of(name))
+                except InputError as problem:
+                    raise InputError("the script names a file that is not there", where=f"{edit.where}: {edit.verb}",
+                        got=str(self.path_of(name)), remedy="paths are relative to the script's folder") from problem  # fmt: skip
+        text = store.json_text(_with_contents(self.canonical(), contents), indent=None)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def conditions(self) -> dict[str, Any]:
+        """The last settings of weather, light and season: records by verb. They change pictures, not geometry."""
+        return {edit.verb: edit.settings for edit in self.edits if edit.verb in CONDITIONS}
+
+    def text(self) -> str:
+        """The script as YAML with all defaults and with absolute paths."""
+        named = {name: str(path.resolve()) for name, path in self.files().items()}
+        return yaml.safe_dump(_with_contents(self.canonical(), named), sort_keys=False)
+
+
+def _with_contents(value: Any, names: Mapping[str, str]) -> Any:
+    """The values of ``file``, ``run`` and ``image`` replaced."""
+    if isinstance(value, list):
+        return [_with_contents(inner, names) for inner in value]
+    if not isinstance(value, dict):
+        return value
+    paths = ("file", "run", "image")
+    return {k: names[v] if k in paths and isinstance(v, str) else _with_contents(v, names) for k, v in value.items()}
+
+
+def read_edits(path: Path | str) -> EditScript:
+    """Read a script.
+
+    Raises:
+        InputError: it is missing, no YAML, or says something that no verb understands.
+    """
+    path = Path(path)
+    return parse_edits(store.read_bytes(path), str(path), path.parent)
+
+
+def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScript:
+    """Check a script.
+
+    Args:
+        where: name of the file for messages. folder: what its paths are relative to.
+    """
+    entries, lines = parse_with_lines(text, where)
+    if not isinstance(entries, list) or not entries:
+        raise InputError("an edit script is a list of edits", where=where, expected="lines such as `- remove: {ids: [car-003]}`",
+            got="nothing" if entries in (None, []) else type(entries).__name__)  # fmt: skip
+    return EditScript(tuple(_one(index, value, lines, where) for index, value in enumerate(entries)), Path(folder))
+
+
+def _one(index: int, value: Any, lines: Lines, where: str) -> ScriptEdit:
+    at = f"{where}, line {lines[(index,)]}"
+    if not isinstance(value, dict) or len(value) != 1:
+        raise InputError("an edit is one verb with its settings", where=at, expected="e.g. `- remove: {ids: [car-003]}`",
+            got=short(value, 80))  # fmt: skip
+    ((verb, settings),) = value.items()
+    if verb not in VERBS:
+        near = nearest(verb, VERBS)
+        raise InputError(f"there is no verb {verb!r}", where=at, expected=f"one of {', '.join(VERBS)}",
+            remedy=f"did you mean {near!r}?" if near else "see docs/edit.md")  # fmt: skip
+    try:
+        return ScriptEdit(verb, VERBS[verb].model_validate({} if settings is None else settings), at)
+    except ValidationError as error:
+        told = first_problem(error, place(verb))
+        steps = [int(step) if step.isdigit() else step for step in re.findall(r"[^.\[\]]+", told.where)]
+        line = _line_at((index, *steps), lines, told.what)
+        raise told.located(f"{where}, line {line}: {told.where}") from error
+
+
+def _line_at(path: tuple[str | int, ...], lines: Lines, said: str) -> int:
+    """The line of a field, of an unknown one that a message names, or of what should hold it."""
+    while path not in lines:
+        path = path[:-1]
+    unknown = (line for inner, line in lines.items() if inner[:-1] == path and f"unknown field {inner[-1]!r}" in said)
+    return next(unknown, lines[path])

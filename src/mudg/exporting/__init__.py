@@ -1,0 +1,1 @@
+"""Fitted scenes and their logs as files of other programs."""

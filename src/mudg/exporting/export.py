@@ -1,0 +1,501 @@
+"""export: a fitted scene, or the cameras of its log -> a file or folder for other programs.
+
+Gaussians:  OUT and OUT.json (format, moment, axes, what the file does not hold, sha256)
+cameras:    OUT/transforms.json ... (nerfstudio), OUT/sparse/0 (COLMAP), OUT/images
+messages:   OUT.mcap (Foxglove), OUT.rrd (rerun), OUT/metadata.yaml and OUT/log_0.mcap (ROS 2),
+            OUT/NAME.ncore4.zarr.itar (NCore)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import geometry, log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.layout import below
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import PointCloud, Scene
+from mudg.base.versions import version
+from mudg.core import harmonics
+from mudg.core.edit import HeightMap
+from mudg.core.harmonics import C0
+from mudg.core.table import Table
+from mudg.editing.apply import ground_of
+from mudg.editing.carried import IMPORTED, carry_out
+from mudg.editing.model import classes_of_rows, lowest_points
+from mudg.editing.runs import RunParts, find_run
+from mudg.editing.script import EditScript
+from mudg.exporting.settings import ExportConfig
+from mudg.formats import ncore as ncore_package
+from mudg.formats.exporters import ncore, ros2
+from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, picture_names, pictures
+from mudg.formats.exporters.foxglove import DIALECT, FoxgloveMessages
+from mudg.formats.exporters.log_records import LogRecords
+from mudg.formats.exporters.mcap import McapBlocks
+from mudg.formats.exporters.rerun_file import package, write_rerun
+from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, unit
+from mudg.formats.splats.formats import FORMATS, WriteRequest, file_from_world, losses
+from mudg.gaussians.model import COLUMNS, SceneModel
+from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
+from mudg.gaussians.rendering import DRAWING
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.storage import load_model, model_of_scene
+from mudg.scene.clouds import read_fused
+from mudg.scene.files import open_files
+from mudg.scene.read import read_points, read_scene
+
+# a log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore -------------------------------------
+
+
+SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
+"""Formats, and the suffix of their file; none: a folder."""
+LOG_FOLDERS: Final = {"ros2": (1, (ros2.METADATA, ros2.FILE)), "ncore": (1, ncore.FILES)}
+"""Formats that are folders: version and files of each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What is told over time: the records of a log, and Gaussians where the format shows them; either may be None."""
+
+    records: LogRecords | None
+    splats: SplatScene | None = None
+
+    @property
+    def summary(self) -> str:
+        """What there is, for people."""
+        parts = []
+        if self.records is not None:
+            parts.append(f"{len(self.records.scene.frames)} pictures, {len(self.records.scene.sweeps)} sweeps")
+        if self.splats is not None:
+            parts.append(f"{sum(len(node.cloud) for node in self.splats.nodes)} Gaussians")
+        return ", ".join(parts)
+
+
+def records_of(scene: Scene, fused: Any = None) -> LogRecords:
+    """The records of a scene on disk; pictures and points are read when they are asked for."""
+    files = open_files(scene.root)
+    return LogRecords(scene, lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep), fused)
+
+
+def refuse_missing(name: str) -> None:
+    """ResourceError if the package of a format is not installed."""
+    if name == "rerun":
+        package()
+    elif name == "ncore":
+        ncore_package.package()
+
+
+def write_log(name: str, told: Told, out: Path) -> dict[str, int]:
+    """Write a log as one file, ``mcap`` or ``rerun``; returns its size."""
+    if name == "rerun":
+        title = told.records.scene.id if told.records is not None else "scene"
+        write_rerun(out, told.records, told.splats, title)
+    elif told.records is not None:
+        store.write_blocks(out, McapBlocks(FoxgloveMessages(told.records), f"mudg {version()}", DIALECT))
+    size = out.stat().st_size
+    log.info(f"export: {told.summary}, {size / 1e6:.2f} MB")
+    return {"bytes": size}
+
+
+def write_messages(name: str, records: LogRecords, out: Path) -> dict[str, Any]:
+    """Write a log as a folder, ``ros2`` or ``ncore``; returns a summary."""
+    content, summary = _bag(records, out) if name == "ros2" else _recording(records, out)
+    told = "".join(f", {count} {what}" for what, count in summary.items())
+    log.info(f"export: {Told(records).summary}{told}, {content.stat().st_size / 1e6:.2f} MB in {out}")
+    return {"format": name, **summary}
+
+
+def _bag(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
+    """A bag of ROS 2: its largest file, and what to say of it."""
+    blocks = McapBlocks(ros2.Ros2Messages(records), f"mudg {version()}", ros2.dialect())
+    store.write_blocks(folder / ros2.FILE, blocks)
+    store.atomic_write(folder / ros2.METADATA, ros2.metadata(blocks.topics, blocks.span))
+    return folder / ros2.FILE, {"messages": sum(number for _, number in blocks.topics.values())}
+
+
+def _recording(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
+    """A recording of NCore."""
+    rolling = [name for name, camera in records.scene.cameras.items() if camera.readout_s > 0]
+    if rolling:
+        log.warn(f"export: a scene does not know which way the shutters of {', '.join(rolling)} roll; ncore says downwards")
+    return ncore.write_ncore(folder, records)[0], {"boxes": len(records.scene.tracks)}
+
+
+# scenes ---------------------------------------------------------------------------------------------------------------
+#
+# A fitted scene as files hold it: plain arrays by object, its motion as keys, its sky as a picture; and a file's Gaussians as a scene.
+
+
+SKY_COUNT: Final = 6000
+SKY_M: Final = 300.0
+CLASS_LOGIT: Final = 5.0
+
+
+@torch.no_grad()
+def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> SplatScene:
+    """A fitted scene in world axes.
+
+    Args:
+        time_s: at which a background that changes with time, which no file holds, is taken. names: of nodes to keep (none: all).
+
+    Raises:
+        UsageError: a node that the scene does not have.
+    """
+    there = [node.name for node in model.nodes]
+    unknown = [name for name in names if name not in there]
+    if unknown:
+        raise UsageError(f"the fitted scene has no node {unknown[0]!r}", where="--nodes", expected=", ".join(there))
+    classes, made = classes_of_rows(model), list[SplatNode]()
+    for index, node in enumerate(model.nodes):
+        rows = (model.table.labels["node"] == index).nonzero()[:, 0]
+        if (names and node.name not in names) or (index and not len(rows)):
+            continue
+        ids = classes[rows.cpu().numpy()]
+        known = None if not model.classes else np.where(ids < 0, UNLABELLED, ids).astype(np.uint8)
+        made.append(_node(node, _given(model, rows), _sh(model, rows), known, time_s))
+    facts = {key: model.facts[key] for key in ("method", "scene", "drawing") if key in model.facts}
+    name = str(model.facts.get("scene", "scene"))
+    return SplatScene(name, tuple(made), sky=None if model.sky is None else sky_picture(model.sky), facts=facts)
+
+
+def _given(model: SceneModel, rows: Tensor) -> tuple[NodeRows, Tensor]:
+    """Rows of a node as ``at_time`` takes them, and their sizes."""
+    own = {name: value.detach()[rows] for name, value in model.table.columns.items()}
+    further = {name: value for name, value in own.items() if name not in COLUMNS}
+    return NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"], further), own["log_scales"]
+
+
+def _sh(model: SceneModel, rows: Tensor) -> NDArray[np.float32]:
+    parts = [model.table[name].detach()[rows] for name in ("sh_dc", "sh_rest") if name in model.table.columns]
+    return torch.cat(parts, 1)[:, : (model.sh_degree + 1) ** 2].cpu().numpy()
+
+
+def _node(
+    node: StaticNode | RigidNode, given: tuple[NodeRows, Tensor], sh: NDArray[np.float32],
+    classes: NDArray[np.uint8] | None, time_s: float,
+) -> SplatNode:  # fmt: skip
+    rows, log_scales = given
+    if not isinstance(node, RigidNode):
+        now = rows if type(node) is StaticNode else node.at_time(rows, time_s)
+        return SplatNode(
+            node.name, _cloud(replace(rows, opacity=rows.opacity * 0) if now is None else now, log_scales, sh, classes)
+        )
+    cloud, displacement = _cloud(rows, log_scales, sh, classes), None
+    keys = node.corrected_keys()
+    if type(node) is DeformableNode:
+        displacement = np.stack([node.displacement(rows.means, float(t)).cpu().numpy() for t in node.times_s])
+    elif type(node) is not RigidNode:  # what only the program itself can move: places at the keys, straight between
+        cloud, displacement = _sampled(node, rows, keys, cloud)
+    size = (node.size_m[0], node.size_m[1], node.size_m[2])
+    return SplatNode(node.name, cloud, node.label, size, node.times_s, keys, displacement)
+
+
+def _cloud(
+    rows: NodeRows, log_scales: Tensor, sh: NDArray[np.float32], classes: NDArray[np.uint8] | None
+) -> SplatCloud:
+    columns = [values.detach().cpu().numpy() for values in (rows.means, rows.quats, log_scales, rows.opacity)]
+    means, quats, logs, opacity = columns
+    full = np.concatenate([rows.sh_dc.detach().cpu().numpy(), sh[:, 1:]], 1)
+    return SplatCloud(means, unit(quats, "the fitted scene"), logs, logit(opacity), full, classes)
+
+
+def _sampled(
+    node: RigidNode, rows: NodeRows, keys: NDArray[np.float64], cloud: SplatCloud
+) -> tuple[SplatCloud, NDArray[np.float32]]:
+    """Gaussians in the frame of the box as they are in the middle of the track, and their displacements at its keys."""
+    middle, places = len(node.times_s) // 2, []
+    for index, moment in enumerate(node.times_s.tolist()):
+        now = node.at_time(rows, moment)
+        if now is None:  # a key lies within the span
+            continue
+        box_from_world = geometry.invert(keys[index])
+        places.append(geometry.transform_points(box_from_world, now.means.cpu().numpy().astype(np.float64)))
+        if index == middle:
+            turn = SplatCloud(
+                cloud.means, unit(now.quats.cpu().numpy(), node.name), cloud.log_scales, cloud.logits, cloud.sh[:, :1]
+            )
+            cloud = replace(cloud, quats=turn.moved(box_from_world).quats)
+    base = places[middle].astype(np.float32)
+    return replace(cloud, means=base), (np.stack(places) - base).astype(np.float32)
+
+
+# -- sky -----------------------------------------------------------------------------------------------------------------
+
+
+def sky_picture(sky: SkyNode) -> NDArray[np.uint8]:
+    """The panorama u8[H, 2 H, 3] of a sky."""
+    values = sky.table["panorama"].detach()[0].clamp(0, 1).cpu().numpy()
+    return np.round(values.transpose(1, 2, 0) * 255).astype(np.uint8)
+
+
+def with_sky_sphere(scene: SplatScene) -> SplatScene:
+    """The scene with its sky as flat Gaussians far away, for files that hold Gaussians alone; unchanged without a sky."""
+    if scene.sky is None:
+        return scene
+    directions = harmonics.spiral(SKY_COUNT)
+    rows, columns = scene.sky.shape[:2]
+    row = ((0.5 - np.arcsin(directions[:, 2].clip(-1, 1)) / np.pi) * rows).astype(int).clip(0, rows - 1)
+    column = ((np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) + 0.5) * columns).astype(int) % columns
+    color = scene.sky[row, column] / 255
+    apart = SKY_M * np.sqrt(4 * np.pi / SKY_COUNT)
+    axis = np.cross([0.0, 0.0, 1.0], directions)  # turns z, the flat side, outwards
+    quats = unit(np.column_stack([1 + directions[:, 2], axis]) + np.array([1e-9, 0, 0, 0]), "sky")
+    solid = scene.nodes[0].cloud
+    center = np.median(solid.means, 0) if len(solid) else np.zeros(3)
+    count = len(directions)
+    flat = np.log(np.tile([0.7 * apart, 0.7 * apart, 0.5], (count, 1)))
+    columns = [values.astype(np.float32) for values in (directions * SKY_M + center, quats, flat, np.full(count, 6.0))]
+    cloud = SplatCloud(*columns, ((color - 0.5) / harmonics.C0)[:, None].astype(np.float32))
+    return replace(scene, nodes=(*scene.nodes, SplatNode("sky", cloud)), sky=None)
+
+
+# -- from files ----------------------------------------------------------------------------------------------------------
+
+
+def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
+    """The Gaussians of a file as a fitted scene in which nothing moves; classes where the file holds them."""
+    columns = {
+        "means": cloud.means, "quats": cloud.quats, "log_scales": cloud.log_scales, "logits": cloud.logits, "sh_dc": cloud.sh[:, :1],
+    }  # fmt: skip
+    if cloud.degree:
+        columns["sh_rest"] = cloud.sh[:, 1:]
+    known: tuple[int, ...] = ()
+    if cloud.class_ids is not None:
+        known = tuple(int(value) for value in np.unique(cloud.class_ids) if value < 19)
+    if known and cloud.class_ids is not None:
+        columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT).astype(
+            np.float32
+        )
+    tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
+    table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
+    drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
+    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name, **drawing})
+
+
+# export ---------------------------------------------------------------------------------------------------------------
+
+
+CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes]]]] = {
+    "nerfstudio": nerfstudio_files, "colmap": colmap_files,
+    "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
+}  # fmt: skip
+"""Formats of cameras: files beside the pictures."""
+_ALL_MOMENTS: Final = ("bundle", "alpasim")
+MOST_POINTS: Final = 500_000
+FOLDERS: Final = {
+    **{name: (1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/")) for name in CAMERAS}, **LOG_FOLDERS
+}
+"""Formats that are folders: version and files of each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exported:
+    """What is exported.
+
+    Args:
+        parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene, edited, or None.
+        edited: whether an edit script was carried out.
+    """
+
+    parts: RunParts
+    model: SceneModel | None
+    log: Scene | None
+    edited: bool = False
+
+    @classmethod
+    def of(cls, parts: RunParts, script: EditScript | None) -> Exported:
+        """The parts of a source, with an edit script carried out."""
+        recorded = None if parts.scene is None else read_scene(parts.scene)
+        if not parts.fits and script is not None:
+            raise UsageError("an edit script is carried out on a fit", where="--edits", got=str(parts.scene),
+                remedy="give the folder of a run")  # fmt: skip
+        if not parts.fits:
+            return cls(parts, None, recorded)
+        model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
+        if script is None:
+            return cls(parts, model, recorded)
+        drive = carry_out(script, model, recorded)
+        return cls(parts, drive.model(model), drive.scene or recorded, edited=True)
+
+
+def parts_of(name: str, source: Path, scene: Path | None) -> RunParts:
+    """Where the parts of a source lie: of a fit, a run, or, for formats without Gaussians, a scene."""
+    alone = name not in FORMATS and ((source / "scene.json").is_file() or source.suffix == ".zip")
+    parts = RunParts({}, source, None, False) if alone else find_run(source)
+    return replace(parts, scene=scene or parts.scene)
+
+
+def check(config: ExportConfig, name: str, out: Path) -> None:
+    """UsageError for an unknown format, a setting that it does not have, or a file whose name does not fit it; ResourceError for a package
+    that is missing."""
+    if name not in FORMATS and name not in CAMERAS and name not in SUFFIXES:
+        known = ", ".join((*FORMATS, *CAMERAS, *SUFFIXES))
+        raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
+    _refuse_settings(config, name)
+    refuse_missing(name)
+    if name not in FOLDERS:
+        _refuse_name(out, name)
+
+
+def write_folder(name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write cameras, or a log over time, to the work folder; returns a summary."""
+    recorded = _known(given)
+    if name not in CAMERAS:
+        return write_messages(name, records_of(recorded, _points(given)), out)
+    names = picture_names(recorded)
+    with log.task("export", len(names)) as bar:
+        for place, content in pictures(recorded):
+            if not (out / place).is_file():
+                store.atomic_write(out / place, content)
+            bar.advance()
+    for place, content in CAMERAS[name](recorded, _points(given)).items():
+        store.atomic_write(out / place, content)
+    return {"format": name, "images": len(names)}
+
+
+def write_file(config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write Gaussians, or a log over time, as one file; returns what the file is."""
+    about = (_messages if name in SUFFIXES else _gaussians)(config, name, given, out)
+    return {"format": name, "mudg": version(), **about}
+
+
+def _refuse_settings(config: ExportConfig, name: str) -> None:
+    moves = name in FORMATS and "motion" in FORMATS[name].carries
+    if config.animated and config.time_s is not None:
+        raise UsageError(
+            "a file holds one moment or the motion", where="--animated, --time-s", remedy="leave one of them out"
+        )
+    if config.animated and not moves:
+        able = ", ".join(key for key, one in FORMATS.items() if "motion" in one.carries)
+        raise UsageError(
+            "this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s"
+        )
+    if name in _ALL_MOMENTS and config.time_s is not None:
+        raise UsageError("a file of this format holds all moments", where="--time-s", got=name, remedy="leave it out, or export ply")
+    set_here = [
+        key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
+    ]
+    refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
+    if refused:
+        flag = refused[0].replace("_", "-")
+        raise UsageError("the format does not have this setting", where=f"--{flag}", got=name, remedy="leave it out")
+
+
+def _refuse_name(out: Path, name: str) -> None:
+    suffixes = (SUFFIXES[name],) if name in SUFFIXES else FORMATS[name].suffixes
+    if not Path(out).name.lower().endswith(suffixes):
+        expected = f"a name that ends in {' or '.join(suffixes)}"
+        raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
+
+
+# -- Gaussians -----------------------------------------------------------------------------------------------------------
+
+
+def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
+    """The scene in the axes of the format, and the moment."""
+    if given.model is None:
+        raise InputError(
+            "there is no fitted scene",
+            where=str(given.parts.scene),
+            expected="a folder made by `mudg fit` or `mudg run`",
+        )
+    moment = config.time_s if config.time_s is not None else middle_s(given.model, given.log)
+    scene = splat_scene(given.model, moment, config.nodes)
+    whole = "motion" in FORMATS[name].carries and config.time_s is None
+    if not scene.nodes or not (whole or any(node.at(moment) is not None and len(node.cloud) for node in scene.nodes)):
+        asked = ", ".join(config.nodes) or "everything"
+        raise UsageError("there is nothing to export", where="--nodes, --time-s", got=f"{asked} at {moment:g} s",
+            remedy="choose a time at which the object is there")  # fmt: skip
+    if config.sky == "sphere":
+        scene = with_sky_sphere(scene)
+    elif config.sky == "none":
+        scene = replace(scene, sky=None)
+    facts = {**scene.facts, "generator": f"mudg {version()}"}
+    scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
+    ground = _ground(given) if name == "alpasim" else None
+    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log, ground)
+
+
+def _ground(given: Exported) -> HeightMap | None:
+    """The height of the ground, by classes of points or Gaussians, else by the lowest Gaussians."""
+    if given.model is None:
+        return None
+    cloud = None if given.parts.fused is None else read_fused(given.parts.fused)
+    found = ground_of(cloud, given.model)
+    lowest = lowest_points(given.model) if found is None else ()
+    return HeightMap.from_points(np.asarray(lowest)) if len(lowest) else found
+
+
+def middle_s(model: SceneModel, recorded: Scene | None) -> float:
+    """The time of the log's middle image; without a log, the middle of what moves; 0 if nothing does."""
+    if recorded is not None and recorded.frames:
+        return float(np.sort([frame.view.time_s for frame in recorded.frames])[len(recorded.frames) // 2])
+    keys = [times for node in model.nodes if len(times := getattr(node, "times_s", ()))]
+    return 0.0 if not keys else (min(float(k[0]) for k in keys) + max(float(k[-1]) for k in keys)) / 2
+
+
+def _gaussians(config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write the Gaussians; returns what the file is."""
+    request = requested(config, name, given)
+    content, lost = FORMATS[name].write(request), losses(name, request)
+    count = _count(request.scene) if request.time_s is None else len(request.cloud)
+    store.atomic_write(out, content)
+    when = "all of the motion" if request.time_s is None else f"at {request.time_s:g} s"
+    log.info(f"export: {count} Gaussians, {when}, {len(content) / 1e6:.2f} MB")
+    for sentence in lost:
+        log.warn(f"export: {name} does not hold {sentence}")
+    return {
+        "bytes": len(content), "gaussians": count, "degree": request.scene.degree, "time_s": request.time_s, "axes": config.axes,
+        "file_from_world": request.scene.file_from_world, "nodes": [node.name for node in request.scene.nodes], "not_in_the_file": lost,
+    }  # fmt: skip
+
+
+def _count(scene: SplatScene) -> int:
+    return sum(len(node.cloud) for node in scene.nodes)
+
+
+# -- cameras and messages -----------------------------------------------------------------------------------------------
+
+
+def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+    """Write the log as messages over time; returns what the file is."""
+    splats, records = None, None
+    if name == "rerun" and given.model is not None:
+        splats = splat_scene(given.model, middle_s(given.model, given.log))
+    if name != "rerun" or given.log is not None:
+        records = records_of(_known(given), _points(given) if splats is None else None)
+    return write_log(name, Told(records, splats), out)
+
+
+def _known(given: Exported) -> Scene:
+    """The recorded scene; InputError if none is known."""
+    if given.log is None:
+        raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
+            remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
+    if given.edited:
+        log.warn(
+            "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"
+        )
+    return given.log
+
+
+def _points(given: Exported) -> PointCloud | None:
+    """Starting points: fused ones, else the centres of the solid Gaussians of the background."""
+    if given.parts.fused is not None:
+        static = read_fused(given.parts.fused).static
+        step = -(-len(static) // MOST_POINTS) or 1
+        return PointCloud(static.xyz[::step].copy(), static.rgb[::step].copy(), "world")
+    if given.model is None:
+        return None
+    cloud = splat_scene(given.model, 0.0, (given.model.nodes[0].name,)).nodes[0].cloud
+    solid = cloud.take(cloud.opacity > 0.5)
+    rgb = np.round((solid.sh[:, 0] * C0 + 0.5).clip(0, 1) * 255).astype(np.uint8)
+    return PointCloud(np.ascontiguousarray(solid.means, np.float32), rgb, "world")

@@ -1,0 +1,221 @@
+"""``mudg batch run|status|retry``: steps over long lists of driving logs, on this machine, Ray or Slurm.
+
+The machinery is in ``fleet/``; what it promises, and how to use it, in docs/batch.md.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mudg import native
+from mudg.base import config as configuration
+from mudg.base import log
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.location import Location
+from mudg.base.plain_yaml import parse_yaml
+from mudg.base.run_folder import refuse_overlaps
+from mudg.fleet import engines, status
+from mudg.fleet.child import Stop
+from mudg.fleet.listed import exit_code
+from mudg.fleet.plan import CITY, COMMAND, OF_A_LINE, REVISION, BatchPlan, Entry, parse_shard, plan_of, read_list, shard
+from mudg.fleet.records import BatchFolder, Ended, slurm_tasks_left
+from mudg.fleet.settings import BatchConfig
+from mudg.fleet.work import DONE, STOPPED, Job, is_open
+from mudg.steps.settings.presets import PresetName, run_preset
+from mudg.steps.settings.run import RunConfig
+
+_POLL_S = 10.0
+
+
+@dataclass(frozen=True)
+class BatchRequest:
+    """What ``mudg batch run`` is asked for.
+
+    Args:
+        listed: path or address of the list. out: path or address of the results. batch: where scenes run. run: settings of the steps.
+            lines: words of every step (``plan_of``). shard: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array job.
+            scratch: folder for unfinished results. take_over: drive the batch even if another driver may be alive elsewhere.
+    """
+
+    listed: str
+    out: str
+    batch: BatchConfig
+    run: RunConfig
+    lines: Mapping[str, Sequence[str]]
+    shard: str = ""
+    wait: bool = False
+    scratch: Path | None = None
+    take_over: bool = False
+
+
+def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
+    """Run the steps of a batch, or submit the tasks that do.
+
+    Args:
+        dry: only say what there is to do.
+
+    Returns:
+        Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
+
+    Raises:
+        UsageError: settings that contradict each other, an output that belongs to another batch, or to another driver. InputError: a
+            bad list. KeyboardInterrupt: asked to stop; running steps have written checkpoints.
+    """
+    listed = read_list(asked.listed, (*OF_A_LINE, REVISION))
+    part = parse_shard(asked.shard)
+    if asked.shard and asked.batch.engine != "local":
+        raise UsageError("the engine itself shares out the list", where="--shard", got=f"--engine {asked.batch.engine}")
+    plan, folder = plan_for(asked.batch, asked.run, asked.lines), BatchFolder(Location.of(asked.out))
+    if folder.out.local is not None:
+        folder = BatchFolder(Location.of(folder.out.local.absolute()))
+    _refuse_overlap(listed, folder, asked.listed)
+    if not dry:
+        folder.begin(plan, listed)
+    done, failed, ours = folder.keys("done"), folder.keys("failed"), shard(listed, part)
+    entries = [entry for entry in ours if is_open(plan, entry, done, failed)]
+    if dry:
+        keys = [unit.key for entry in ours for unit in plan.units(entry)]
+        counts = {"scenes": len(ours), "steps": len(keys), DONE: len(done.intersection(keys)), "failed": len(failed.intersection(keys))}
+        left = counts["steps"] - counts[DONE] - counts["failed"]
+        text = f"{len(ours)} scenes: {' -> '.join(stage.name for stage in plan.stages)}"
+        return {**counts, "left": left, "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"}
+    job = Job(folder, plan, max(1, round(asked.batch.cpus)), asked.batch.grace_s, _absolute(asked.scratch))
+    with folder.owned(part, numbered=asked.shard.startswith("env"), take_over=asked.take_over) as owner:
+        if asked.batch.engine == "slurm" and entries:
+            number, messages = engines.submit_to_slurm(job, entries, asked.batch)
+            me = next(one for one in folder.owners().values() if one.process == os.getpid())
+            owner.save(me.model_copy(update={"job": number}).model_dump_json().encode())
+            return _submitted(folder, plan, entries, number, messages, asked.wait)
+        counts = _run(job, entries, asked.batch)
+    text = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "nothing was left to do here"
+    return {"counts": dict(counts), "out": str(folder.out), "text": f"{text}\nmudg batch status {folder.out}",
+            "exit_code": exit_code(counts.total() - counts[DONE])}  # fmt: skip
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else path.absolute()
+
+
+def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    with log.task("batch", len(entries) * len(job.plan.stages)) as bar:
+
+        def tell(report: Ended) -> None:
+            if report.state != STOPPED:
+                counts[report.state] += 1
+            if report.state not in (DONE, STOPPED) and batch.engine == "ray":
+                log.warn(f"{report.scene} {report.stage} {report.state}: {report.words}")
+            bar.advance()
+
+        if batch.engine == "ray":
+            engines.run_on_ray(job, entries, batch, tell)
+            return counts
+        cores = native.default_threads()
+        jobs = max(1, min(batch.jobs or cores, len(entries)))
+        threads = max(1, cores // jobs)
+        log.info(f"batch: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
+        engines.LocalRun(replace(job, threads=threads), entries, jobs, Stop(job.grace_s)).run(tell)
+    return counts
+
+
+def _submitted(
+    folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry], number: str, messages: Path, wait: bool
+) -> dict[str, Any]:
+    result = {"job": number, "out": str(folder.out), "text": f"job {number}; its messages: {messages}\nmudg batch status {folder.out}"}
+    if not wait:
+        return result
+    try:
+        while slurm_tasks_left(number):
+            time.sleep(_POLL_S)
+    except OSError as error:
+        raise ResourceError("Slurm does not answer", where="squeue", got=str(error)) from error
+    done = folder.keys("done")
+    return {**result, "exit_code": exit_code(sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries))}
+
+
+def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]]) -> BatchPlan:
+    """The plan that settings ask for; paths in the settings that exist from here are made absolute, since steps run elsewhere."""
+    values = _with_absolute_paths(configuration.to_dict(settings))
+    own = bool(batch.command) and batch.stages == BatchConfig().stages
+    command = tuple(os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word for word in batch.command)
+    names = () if own else tuple(name for name in batch.stages if name != COMMAND or command)
+    return plan_of(names, lines, values, command)
+
+
+def _with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: _with_absolute_paths(value) if isinstance(value, Mapping)
+        else os.path.abspath(value) if isinstance(value, str) and "/" in value and os.path.exists(value) else value
+        for name, value in values.items()
+    }  # fmt: skip
+
+
+def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) -> None:
+    out, place = folder.out.local, Location.of(listed).local
+    if out is None:
+        return
+    read: dict[str, Path | str | None] = {
+        f"source of {entry.name}": entry.source for entry in entries if entry.source != CITY and "://" not in entry.source
+    }
+    read["list"] = place if place is not None and place.is_file() else None
+    refuse_overlaps([out], read)
+
+
+def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:
+    """How far a batch is, what has failed and what it took.
+
+    Args:
+        html: also write ``status.html`` in its folder. price: of a core-hour. every_s: show it again until nothing is left (0: once).
+    """
+    while True:
+        state = status.read_status(BatchFolder(Location.of(out)), price)
+        result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}
+        if html:
+            page = Location.of(out) / "status.html"
+            page.save(status.page_of(state).encode())
+            result |= {"page": str(page), "text": f"{result['text']}\npage: {page}"}
+        if every_s <= 0 or not result["left"]:
+            return result
+        log.info(*result["text"].splitlines())
+        time.sleep(every_s)
+
+
+def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:
+    """Settings of the steps: a preset, then a file of ``mudg run``, then ``STEP.NAME=VALUE``.
+
+    Raises:
+        UsageError: an unknown setting or a value out of range.
+    """
+    values: dict[str, Any] = {}
+    for text in given:
+        name, separator, value = text.partition("=")
+        if not separator or not name:
+            raise UsageError("not a setting", where="--set", got=text, expected="STEP.NAME=VALUE, as fit.iterations=500")
+        values[name] = parse_yaml(value.encode(), f"--set {name}") if value else ""
+    return configuration.load(RunConfig, run_preset(preset), config, configuration.nested(values))
+
+
+def retry(out: str, reason: str = "") -> dict[str, Any]:
+    """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty: all).
+
+    Raises:
+        InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes.
+    """
+    folder, words = BatchFolder(Location.of(out)), reason.replace(",", " ").split()
+    if not all(word.isdecimal() for word in words):
+        raise UsageError("unknown reason", where="--reason", got=reason, expected="exit codes with commas, as 5,137")
+    folder.stages()
+    failures = list(folder.records("failed"))
+    chosen = [one for one in failures if not words or one.code in map(int, words)]
+    for one in chosen:
+        folder.record("failed", one.key).remove()
+    if words and not chosen:
+        raise InputError("nothing failed for this reason", where=str(folder.out), got=reason,
+            expected=", ".join(sorted({str(one.code) for one in failures})) or "no failures at all")  # fmt: skip
+    return {"forgotten": len(chosen), "text": f"{len(chosen)} failed steps will be tried again by the next mudg batch run"}

@@ -1,0 +1,223 @@
+"""Engines: who runs the scenes of a batch. Threads of this process, tasks of a Ray cluster, or an array job of Slurm, through submitit.
+
+Scheduling, retries of lost workers and requeueing belong to the engine. All of them call ``run_scene``, which does only what is missing.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import os
+import queue
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from mudg.base import log, store
+from mudg.base.errors import ResourceError, UsageError
+from mudg.base.location import Location
+from mudg.fleet.child import Stop
+from mudg.fleet.plan import REVISION, Entry
+from mudg.fleet.records import Ended
+from mudg.fleet.settings import BatchConfig
+from mudg.fleet.work import LOST, Job, run_scene
+
+Tell = Callable[[Ended], None]
+_LOST_NODES: Final = 20
+"""How often Ray runs a scene again whose node or process is gone."""
+_AT_ONCE: Final = 2000
+"""Scenes that wait in Ray's queue at a time."""
+_GB: Final = 1_000_000_000
+
+
+# this machine ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class LocalRun:
+    """Scenes on this machine, ``jobs`` at a time. The log of the next scene is fetched meanwhile."""
+
+    job: Job
+    entries: Sequence[Entry]
+    jobs: int
+    stop: Stop
+    _threads: list[concurrent.futures.Future[None]] = field(default_factory=list)
+    _ahead: dict[str, threading.Thread] = field(default_factory=dict)
+
+    def run(self, tell: Tell) -> None:
+        """Do them all. Ctrl-C and SIGTERM stop every step with a checkpoint, a second one at once; KeyboardInterrupt goes on then."""
+        waiting, told = deque(self.entries), queue.SimpleQueue[Ended | None]()
+
+        def work() -> None:
+            try:
+                while waiting and not self.stop.asked:
+                    try:
+                        entry = waiting.popleft()
+                    except IndexError:  # another thread took the last one
+                        return
+                    self._fetch_ahead(entry, waiting)
+                    for report in run_scene(self.job, entry, self.stop):
+                        told.put(report)
+            finally:
+                told.put(None)
+
+        with concurrent.futures.ThreadPoolExecutor(self.jobs) as pool:
+            try:
+                self._threads = [pool.submit(work) for _ in range(self.jobs)]
+                left = self.jobs
+                while left:
+                    report = told.get()
+                    if report is not None:
+                        tell(report)
+                        continue
+                    left -= 1
+                    for thread in concurrent.futures.wait(self._threads, 0.0).done:
+                        thread.result()
+            except BaseException:
+                self.stop.ask()
+                try:
+                    self.wait()
+                except KeyboardInterrupt:
+                    self.stop.ask()
+                raise
+            finally:
+                self.job.inputs.clear()
+
+    def wait(self) -> None:
+        """Wait until no step runs."""
+        concurrent.futures.wait(self._threads)
+
+    def _fetch_ahead(self, entry: Entry, waiting: Sequence[Entry]) -> None:
+        """Wait for the log of this scene, if it is under way, and begin to fetch that of the next one."""
+        thread = self._ahead.pop(entry.name, None)
+        while thread is not None and thread.is_alive() and not self.stop.asked:
+            thread.join(0.2)
+        for following in list(waiting)[:1]:
+            first = next(self.job.plan.units(following))
+            reads = "://" in following.source and "{source}" in " ".join(first.stage.words) and not first.stage.direct
+            if reads and following.name not in self._ahead and not self.job.folder.record("done", first.key).exists():
+                version = following.settings.get(REVISION, "")
+                self._ahead[following.name] = self.job.inputs.fetch_ahead(Location.of(following.source), version, self.stop)
+
+
+# Ray ------------------------------------------------------------------------------------------------------------------
+
+
+def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tell) -> None:
+    """One task of a Ray cluster per scene: the one at ``ray_address``, the one Ray finds, or one on this machine.
+
+    Raises:
+        ResourceError: Ray is not installed, or no cluster answers. KeyboardInterrupt: stopped; running steps have written checkpoints.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ResourceError("the package ray is not installed", where="--engine ray", remedy="pip install 'mudg[ray]'") from error
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if not ray.is_initialized():
+        try:
+            ray.init(address=batch.ray_address or None, log_to_driver=False, logging_level="warning")
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ResourceError("no Ray cluster answers", where="--ray-address", got=str(error).split("\n")[0][:300]) from error
+    memory = {"memory": int(batch.memory_gb * _GB)} if batch.memory_gb else {}
+    options: dict[str, Any] = {"num_cpus": batch.cpus, "num_gpus": batch.gpus, "max_retries": _LOST_NODES, **memory}
+    task, common = ray.remote(scheduling_strategy="SPREAD", **options)(_ray_task), ray.put(job)
+    left, running = deque(entries), dict[Any, Entry]()
+    try:
+        while left or running:
+            while left and len(running) < _AT_ONCE:
+                entry = left.popleft()
+                running[task.remote(common, entry)] = entry
+            for one in ray.wait(list(running), timeout=1.0)[0]:
+                entry = running.pop(one)
+                try:
+                    for report in ray.get(one):
+                        tell(report)
+                except ray.exceptions.RayError as error:
+                    words = str(error).splitlines()[0][:300]
+                    tell(Ended(scene=entry.name, stage=job.plan.stages[0].name, key="none", state=LOST, words=words))
+    except KeyboardInterrupt:
+        for one in running:
+            ray.cancel(one, force=False)
+        ray.wait(list(running), num_returns=len(running), timeout=job.grace_s + 10) if running else None
+        raise
+
+
+def _ray_task(job: Job, entry: Entry) -> list[Ended]:
+    log.set_quiet(True)
+    return run_scene(job, entry, Stop(job.grace_s))
+
+
+# Slurm ----------------------------------------------------------------------------------------------------------------
+
+
+class SlurmTask:
+    """The scenes of one task of an array job. Told that its time ends, it writes checkpoints, and submitit puts it back into the queue."""
+
+    def __init__(self, job: Job, entries: Sequence[Entry]) -> None:
+        self._job, self._entries = job, entries
+        self._run: LocalRun | None = None
+
+    def __call__(self) -> dict[str, int]:
+        """Do the scenes; returns how many steps ended how."""
+        counts: dict[str, int] = {}
+        self._run = LocalRun(self._job, self._entries, 1, Stop(self._job.grace_s))
+        signal.signal(signal.SIGTERM, lambda *_: self._run.stop.ask() if self._run is not None else None)
+        self._run.run(lambda report: counts.update({report.state: counts.get(report.state, 0) + 1}))
+        self._run = None
+        return counts
+
+    def checkpoint(self) -> Any:
+        """Called by submitit when the job is about to end: stop, and say what is to be run again."""
+        from submitit.helpers import DelayedSubmission
+
+        if self._run is not None:
+            self._run.stop.ask()
+            self._run.wait()
+        return DelayedSubmission(SlurmTask(self._job, self._entries))
+
+
+def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> tuple[str, Path]:
+    """Submit an array job of ``batch.jobs`` tasks; returns its number and the folder of its messages.
+
+    Raises:
+        ResourceError: submitit is not installed, or there is no Slurm, or it refuses. UsageError: options that cannot be.
+    """
+    try:
+        import submitit
+    except ImportError as error:
+        raise ResourceError("the package submitit is not installed", where="--engine slurm", remedy="pip install 'mudg[slurm]'") from error
+    local, given = job.folder.own.local, dict(_option(text) for text in batch.slurm_options)
+    if "time" not in given:
+        raise UsageError("Slurm needs to know how long a task may run", where="--slurm-options", expected="time=4:00:00 among them")
+    folder = local / "slurm" if local is not None else Path.cwd() / "mudg-batch-slurm"
+    store.make_folder(folder)
+    folder.chmod(0o700)  # tasks are pickles that nobody else may write
+    count = max(1, min(batch.jobs or 1, len(entries)))
+    try:
+        executor = submitit.AutoExecutor(folder=folder / "%j", cluster="slurm", slurm_max_num_timeout=1000)
+        executor.update_parameters(
+            name="mudg-batch", cpus_per_task=max(1, round(batch.cpus)), slurm_signal_delay_s=int(batch.grace_s) + 20,
+            slurm_array_parallelism=count, slurm_additional_parameters={**given, "requeue": True},
+            **({"mem_gb": batch.memory_gb} if batch.memory_gb else {}), **({"gpus_per_node": round(batch.gpus)} if batch.gpus else {}),
+        )  # fmt: skip
+        with executor.batch():
+            tasks = [executor.submit(SlurmTask(job, entries[index::count])) for index in range(count)]
+    except (RuntimeError, submitit.core.utils.FailedJobError, OSError) as error:
+        raise ResourceError("Slurm refused, or is not on this machine", where="sbatch", got=str(error).strip()[:500],
+            remedy="run this on a login node, or take another --engine") from error  # fmt: skip
+    return str(tasks[0].job_id).partition("_")[0], folder
+
+
+def _option(text: str) -> tuple[str, str | bool]:
+    name, separator, value = text.partition("=")
+    if not name or name.startswith("-") or any(letter in text for letter in "\n\r") or name in _OWN_OPTIONS:
+        raise UsageError("not an option for the array job", where="--slurm-options", got=text[:80],
+            expected="NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS)))  # fmt: skip
+    return name, value if separator else True
+
+
+_OWN_OPTIONS: Final = frozenset({"array", "job-name", "signal", "requeue", "no-requeue", "open-mode", "output", "error", "cpus-per-task"})

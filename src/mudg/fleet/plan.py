@@ -1,0 +1,301 @@
+"""What a batch does: the scenes of its list, its steps, the command of each, and the content key of a step of a scene.
+
+A list has one source a line, ``SOURCE [name=NAME] [setting=value ...]``, quoted as in a shell; ``#`` starts a comment.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from mudg.base import store
+from mudg.base.config import without_devices
+from mudg.base.errors import InputError, UsageError
+from mudg.base.location import Location
+from mudg.base.versions import version
+from mudg.scene.schema import NAME_PATTERN
+
+CITY: Final = "city"
+BOOKKEEPING: Final = "_batch"
+"""Folder of a batch's own records, in its output."""
+_LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|\..*|status(-\d+-of-\d+)?\.json")
+SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
+    ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
+    ("JOB_COMPLETION_INDEX", "", ""),
+    ("SKYPILOT_JOB_RANK", "SKYPILOT_NUM_JOBS", ""),
+    ("SKYPILOT_NODE_RANK", "SKYPILOT_NUM_NODES", ""),
+    ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE", ""),
+)
+"""Variables with which schedulers number their tasks: the index, the count and the lowest index (empty: 0)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line of a list: the source, the name of its output folder, and settings of its own (``sequence``, ``frames``, ...)."""
+
+    name: str
+    source: str
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
+    """Entries of a list file, or one for each entry of a folder (but for what an earlier run over a list wrote there).
+
+    Relative sources count from the list's folder. Without a name, the last part of the source is taken.
+
+    Args:
+        listed: a path, or an address (``s3://...``). settings: settings a line may give.
+
+    Raises:
+        InputError: missing, empty, malformed, or two lines that would write one folder.
+    """
+    place = Location.of(listed)
+    if place.local is not None and place.local.is_dir():
+        names = sorted(path.name for path in place.local.iterdir() if not _LEFT_OUT.fullmatch(path.name))
+        lines, folder = [(str(place.local / name), shlex.quote(name)) for name in names], place.text
+    else:
+        text = place.load().decode("utf-8", "replace")
+        lines = [(f"{place}: line {index + 1}", line) for index, line in enumerate(text.splitlines())]
+        folder = place.text.rpartition("/")[0] if place.local is None else str(place.local.parent)
+    entries = [entry for where, line in lines if (entry := _entry(line, where, folder, settings)) is not None]
+    if not entries:
+        raise InputError("the list is empty", where=str(place), expected="one source per line")
+    sources: dict[str, str] = {}
+    for entry in entries:
+        if entry.name in sources:
+            raise InputError("two entries would write the same folder", where=str(place), got=f"{sources[entry.name]} and {entry.source}",
+                remedy=f"give one of them another name: SOURCE name={entry.name}-2")  # fmt: skip
+        sources[entry.name] = entry.source
+    return entries
+
+
+def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry | None:
+    try:
+        words = shlex.split(line, comments=True)
+    except ValueError as error:
+        raise InputError("cannot parse the line", where=where, got=line[:80]) from error
+    if not words:
+        return None
+    given: dict[str, str] = {}
+    for word in words[1:]:
+        key, separator, value = word.partition("=")
+        if not separator or key not in ("name", *settings):
+            raise InputError(
+                "unknown setting in the line", where=where, got=word[:80],
+                expected=", ".join(f"{key}=..." for key in ("name", *settings)),
+                remedy="put quotes around a path with spaces")  # fmt: skip
+        given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
+    source = words[0] if words[0] == CITY else _below(folder, words[0])
+    name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
+    if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
+        raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
+    return Entry(name, source, given)
+
+
+def _below(folder: str, source: str) -> str:
+    """A source of a list in this folder; both may be addresses."""
+    if "://" in source:
+        return Location.of(source).text
+    if "://" in folder and not source.startswith(("/", "~")):
+        return f"{folder}/{source}"
+    return os.path.abspath(Path("" if "://" in folder else folder) / Path(source).expanduser())
+
+
+def shard_of(name: str, count: int) -> int:
+    """Which of ``count`` shards a scene belongs to: a hash of its name, so that it stays there when the list grows."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) % count
+
+
+def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
+    """(i, n) of ``"i/n"``; of ``"env"`` and ``"env/n"``, where the environment of a scheduler says i; (0, 1) of an empty text.
+
+    Raises:
+        UsageError: not of this form, or the environment does not say it.
+    """
+    if not text:
+        return 0, 1
+    first, _, count = text.partition("/")
+    if first == "env":
+        first, count = _numbered(count, environment)
+    if not first.isdecimal() or not count.isdecimal() or not int(first) < int(count):
+        raise UsageError("invalid shard", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n",
+            got=text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}")  # fmt: skip
+    return int(first), int(count)
+
+
+def _numbered(count: str, environment: Mapping[str, str]) -> tuple[str, str]:
+    for index_name, count_name, lowest_name in SHARD_VARIABLES:
+        index = environment.get(index_name, "")
+        if index:
+            lowest = environment.get(lowest_name, "") or "0"
+            index = str(int(index) - int(lowest)) if index.isdecimal() and lowest.isdecimal() else index
+            return index, count or environment.get(count_name, "")
+    raise UsageError("no scheduler has numbered this task", where="--shard env",
+        expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment")  # fmt: skip
+
+
+def shard(entries: Sequence[Entry], part: tuple[int, int]) -> list[Entry]:
+    """Entries of the i-th of n shards."""
+    return [entry for entry in entries if shard_of(entry.name, part[1]) == part[0]]
+
+
+# steps ----------------------------------------------------------------------------------------------------------------
+
+RULES_VERSION: Final = 2
+"""Counts up when keys or commands change their meaning: results of older batches are then made again."""
+OF_A_LINE: Final = ("format", "frames", "cameras", "sequence", "poses", "boxes", "seed")
+"""Settings of ingest that a line of the list may give; seed is that of a generated city."""
+REVISION: Final = "revision"
+"""Setting of a line that only changes the key: another content at the same address."""
+
+
+_PLACEHOLDER: Final = re.compile(r"\{(\w+)\}")
+COMMAND: Final = "command"
+"""Name of the step that is a program of the user's own."""
+
+
+@dataclass(frozen=True)
+class BatchStage:
+    """A step of a batch. words: its command, with names in braces; needs: steps whose results it reads; settings: what ``--config``
+    holds for it; direct: whether results are made right below the output, by the scene's name alone."""
+
+    name: str
+    words: tuple[str, ...]
+    needs: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    direct: bool = False
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is a program of the user's own."""
+        return self.name == COMMAND
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A step of a scene: what is claimed, done and recorded."""
+
+    entry: Entry
+    stage: BatchStage
+    key: str
+    needs: Mapping[str, str]
+    """Step -> key of the results it reads."""
+
+    @property
+    def place(self) -> str:
+        """Folder of its result below the output."""
+        return self.entry.name if self.stage.direct else f"{self.entry.name}/{self.stage.name}/{self.key[:12]}"
+
+    @property
+    def title(self) -> str:
+        """For messages."""
+        return f"{self.entry.name} {self.stage.name}"
+
+
+@dataclass(frozen=True)
+class BatchPlan:
+    """The steps of a batch, in order. The list is not part of it: it may grow."""
+
+    stages: tuple[BatchStage, ...]
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values: what must be the same for all who work on a batch."""
+        stages = [{**asdict(stage), "settings": without_devices(stage.settings)} for stage in self.stages]
+        return {"schema": 1, "version": version(), "rules": RULES_VERSION, "stages": stages}
+
+    def units(self, entry: Entry) -> Iterator[Unit]:
+        """The steps of a scene, in order."""
+        keys: dict[str, str] = {}
+        for stage in self.stages:
+            needs = {name: keys[name] for name in stage.needs}
+            unit = Unit(entry, stage, _key(stage, entry, needs), needs)
+            keys[stage.name] = unit.key
+            yield unit
+
+
+_version = functools.cache(version)
+
+
+def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
+    """Content key: of the log's identity, settings, version and the keys of what is read."""
+    values = [
+        RULES_VERSION, _version(), stage.name, list(stage.words), without_devices(stage.settings), entry.name, entry.source,
+        dict(entry.settings), dict(needs),
+    ]  # fmt: skip
+    return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
+
+
+def plan_of(
+    names: Sequence[str], lines: Mapping[str, Sequence[str]], settings: Mapping[str, Any], command: Sequence[str] = ()
+) -> BatchPlan:
+    """The plan of these steps.
+
+    Args:
+        lines: words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}`` for that of
+            annotate or ingest, or for the source.
+        settings: those of ``mudg run``, as JSON values. command: a program of the user's own, as the step ``command``.
+
+    Raises:
+        UsageError: an unknown step, one twice, or one whose inputs no step makes.
+    """
+    if command:
+        if COMMAND not in names:
+            names = (*names, COMMAND)
+        if "{out}" not in " ".join(command):
+            raise UsageError("a command must be told where to write", where="--command", expected="{out} among its words")
+    known = {**lines, **({COMMAND: command} if command else {})}
+    stages: list[BatchStage] = []
+    for name in names:
+        if name not in known:
+            raise UsageError("there is no such step", where="--stages", got=name, expected=", ".join(lines))
+        made = [stage.name for stage in stages]
+        scene = next((one for one in ("annotate", "ingest") if one in made), "source")
+        words = tuple(word if name == COMMAND else word.replace("{scene}", "{" + scene + "}") for word in known[name])
+        read = set(_PLACEHOLDER.findall(" ".join(words)))
+        missing = (read & set(lines)) - set(made)
+        if missing and name != COMMAND:
+            raise UsageError(f"the step {name} needs {' and '.join(sorted(missing))} before it", where="--stages", got=" ".join(names))
+        own = {} if name == COMMAND else dict(settings if name == "run" else settings[name])
+        stages.append(BatchStage(name, words, tuple(one for one in made if one in read), own))
+    if len(set(names)) < len(names) or not names:
+        raise UsageError("each step at most once, and at least one", where="--stages", got=" ".join(names))
+    return BatchPlan(tuple(stages))
+
+
+def listed_plan(words: Sequence[str], settings: Mapping[str, Any]) -> BatchPlan:
+    """The plan of one step over a list, whose results lie right below the output."""
+    return BatchPlan((BatchStage(words[0], tuple(words), (), settings, direct=True),))
+
+
+def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:
+    """The command line of a step of a scene.
+
+    Args:
+        places: ``source`` and steps -> where they lie. out: folder to write. config: file of its settings, if it has any.
+    """
+    filled = {**places, "out": out, "name": unit.entry.name}
+    words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in unit.stage.words]
+    if unit.stage.is_own:
+        return words
+    groups = {"ingest": "", "run": "ingest."}
+    own = list(line_words(unit.entry.settings, groups[unit.stage.name])) if unit.stage.name in groups else []
+    return [sys.executable, "-m", "mudg", *words, "--out", out, "--quiet", *(["--config", config] if config else []), *own]
+
+
+def line_words(settings: Mapping[str, str], group: str = "") -> Iterator[str]:
+    """Flags for the settings of a line of the list. group: what their names begin with: ``ingest.`` in the chain."""
+    for name, value in settings.items():
+        if name == "cameras":
+            yield from (f"--{group}cameras", *value.split(","))
+        elif name == "seed":
+            yield f"--{group}city.seed={value}"
+        elif name in OF_A_LINE:
+            yield f"--{group}{name}={value}"

@@ -1,0 +1,268 @@
+"""Where everything of a batch lies, what its records must be to be used, and who drives it.
+
+    OUT/<scene>/<step>/<key>/           results
+    OUT/_batch/plan.json                steps, commands, settings, version
+              list.<digest>.json        scenes of every list that was given
+              owner*.json               the driver, or one of each shard
+              done/<key>.json           a result is one from this record on; written last
+              failed/<key>.json         why a step has no result
+              logs/<key>.txt            the end of what a failed step said
+              work/ partial/            unfinished results
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from mudg.base import store
+from mudg.base.config import differences
+from mudg.base.errors import InputError, UsageError
+from mudg.base.location import Location
+from mudg.base.processes import process_alive
+from mudg.base.records import first_problem
+from mudg.fleet.plan import BOOKKEEPING, BatchPlan, Entry
+from mudg.scene.schema import NAME_PATTERN
+
+Kind = TypeVar("Kind", bound=BaseModel)
+Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=10**15)]
+Name = Annotated[str, Field(pattern=f"^{NAME_PATTERN.pattern}$")]
+"""Becomes a part of a path."""
+_LISTED: Final = TypeAdapter(list[tuple[Name, str, dict[str, str]]])
+_OWNER: Final = re.compile(r"owner(-\d+-of-\d+)?\.json")
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore")
+
+
+class CorpusFacts(_Record):
+    """Facts about the log that a result holds a scene of."""
+
+    dataset: str = ""
+    cameras: Count = 0
+    images: Count = 0
+    seconds: Amount = 0.0
+    metres: Amount = 0.0
+    objects: dict[str, Count] = {}
+
+
+class Ended(_Record):
+    """How a step of a scene ended: done or failed, which is put on record; or stopped, or lost by its engine. lost_s: processor seconds
+    of attempts without a result."""
+
+    scene: Name
+    stage: Name
+    key: Annotated[str, Field(pattern=r"^[A-Za-z0-9]+$")]
+    source: str = ""
+    place: str = ""
+    digest: str = ""
+    state: str = ""
+    host: str = ""
+    code: Annotated[int, Field(ge=-1000, le=1000)] = 0
+    words: str = ""
+    ended: Amount = 0.0
+    seconds: Amount = 0.0
+    processor_s: Amount = 0.0
+    lost_s: Amount = 0.0
+    written_bytes: Count = 0
+    peak_bytes: Count | None = None
+    facts: CorpusFacts | None = None
+
+
+class Owner(_Record):
+    """Who drives a batch, or one shard of it. job: number of the Slurm job that does."""
+
+    host: str
+    process: Annotated[int, Field(ge=0, lt=2**31)]
+    since: Amount
+    shard: tuple[Count, Count] = (0, 1)
+    job: Annotated[str, Field(pattern=r"^\d*$")] = ""
+
+    def is_alive(self) -> bool | None:
+        """Whether it still works; None where that cannot be known from here."""
+        if self.job:
+            with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+                return slurm_tasks_left(self.job) > 0
+            return None
+        if self.host != this_host():
+            return None
+        return self.process != os.getpid() and process_alive(self.process)
+
+    def __str__(self) -> str:
+        what = f"job {self.job}" if self.job else f"process {self.process}"
+        return f"{what} on {self.host.split(' ')[0]} since {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(self.since))}"
+
+
+class _StageRecord(_Record):
+    name: Name
+
+
+class _PlanRecord(_Record):
+    stages: Annotated[list[_StageRecord], Field(min_length=1)]
+
+
+def _checked(kind: type[Kind], content: bytes, where: str, remedy: str) -> Kind:
+    """A record, if it is one of this kind; InputError names file and field."""
+    try:
+        return kind.model_validate_json(store.json_text(store.parse_json(content, where), indent=None))
+    except ValidationError as error:
+        problem = first_problem(error, f"{where}: ")
+        raise InputError(f"a record of the batch is damaged: {problem.what}", where=problem.where, expected=problem.expected,
+            got=problem.got, remedy=remedy) from error  # fmt: skip
+
+
+def this_host() -> str:
+    """This machine, or this container of it: where process numbers mean the same."""
+    space = ""
+    with contextlib.suppress(OSError):
+        space = os.readlink("/proc/self/ns/pid")
+    return f"{socket.gethostname()} {space}".strip()
+
+
+def slurm_tasks_left(job: str) -> int:
+    """Tasks of a Slurm job that wait or run. OSError: there is no Slurm here, or it does not answer."""
+    words = ["squeue", "--noheader", "--array", "--jobs", job, "--format", "%i"]
+    answer = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    if answer.returncode and "Invalid job id" not in answer.stderr:
+        raise OSError(answer.stderr.strip()[:300])
+    return len(answer.stdout.split()) if not answer.returncode else 0
+
+
+@dataclass(frozen=True)
+class BatchFolder:
+    """The output of a batch."""
+
+    out: Location
+
+    @property
+    def own(self) -> Location:
+        """Folder of the batch's own records."""
+        return self.out / BOOKKEEPING
+
+    def record(self, kind: Literal["done", "failed"], key: str) -> Location:
+        """Record of a step that is done or has failed."""
+        return self.own / kind / f"{key}.json"
+
+    def log(self, key: str) -> Location:
+        """The end of what a failed step said."""
+        return self.own / "logs" / f"{key}.txt"
+
+    def partial(self, key: str) -> Location:
+        """An unfinished result, put here by a worker that was asked to stop."""
+        return self.own / "partial" / key
+
+    def keys(self, kind: Literal["done", "failed"]) -> set[str]:
+        """Keys on record, from one listing."""
+        return {name.removesuffix(".json") for name in (self.own / kind).names()}
+
+    def records(self, kind: Literal["done", "failed"]) -> Iterator[Ended]:
+        """All records of a kind. InputError: one is damaged."""
+        folder = self.own / kind
+        for name, content in folder.load_below(folder.names()).items():
+            yield _checked(Ended, content, f"{folder}/{name}", "remove it: the step is done again")
+
+    def end(self, kind: Literal["done", "failed"], ended: Ended) -> None:
+        """Put the end of a step on record."""
+        content = json.dumps({"schema": 1, **ended.model_dump()}, ensure_ascii=False, allow_nan=False)
+        self.record(kind, ended.key).save(content.encode())
+
+    # plan and list -----------------------------------------------------------------------------------------------------
+
+    def begin(self, plan: BatchPlan, entries: Sequence[Entry]) -> None:
+        """Put plan and list on record, or check that they are the same.
+
+        Raises:
+            UsageError: the folder holds a batch of other steps or settings, or something else.
+        """
+        file, record = self.own / "plan.json", json.loads(store.json_text(plan.record()))
+        names = [name for name in self.out.names() if not name.startswith(".")] if self.out.local is not None else []
+        if names and BOOKKEEPING not in names:  # another shard may begin at the same moment
+            raise UsageError("the output holds files of something else", where=str(self.out), remedy="choose an empty --out")
+        if not file.save((store.json_text(record) + "\n").encode(), only_if_absent=True):
+            before = store.parse_json(file.load(), str(file))
+            if before != record:
+                raise UsageError("the output holds a batch of other steps or settings", where=str(self.out),
+                    got="; ".join(differences(before, record)[:8]), remedy="choose another --out")  # fmt: skip
+        values = [[one.name, one.source, dict(one.settings)] for one in sorted(entries, key=lambda one: one.name)]
+        content = json.dumps(values, ensure_ascii=False).encode()
+        listed = self.own / f"list.{hashlib.sha256(content).hexdigest()[:12]}.json"
+        if not listed.exists():
+            listed.save(content)
+
+    def stages(self) -> list[str]:
+        """Names of the steps. InputError: no batch is here, or its record is damaged."""
+        file = self.own / "plan.json"
+        if not file.exists():
+            raise InputError("no batch is here", where=str(self.out), expected="the --out of a mudg batch run")
+        return [one.name for one in _checked(_PlanRecord, file.load(), str(file), "begin the batch again in another folder").stages]
+
+    def scenes(self) -> list[str]:
+        """Names of the scenes of all lists that were ever given. InputError: a list is damaged."""
+        scenes: set[str] = set()
+        for name in self.own.names():
+            if name.startswith("list."):
+                where = str(self.own / name)
+                try:
+                    scenes.update(row[0] for row in _LISTED.validate_python(store.parse_json((self.own / name).load(), where)))
+                except ValidationError as error:
+                    raise first_problem(error, f"{where}: ") from error
+        return sorted(scenes)
+
+    # drivers -----------------------------------------------------------------------------------------------------------
+
+    def owners(self) -> dict[str, Owner]:
+        """Drivers on record, by the names of their files. InputError: a record is damaged."""
+        names = [name for name in self.own.names() if _OWNER.fullmatch(name)]
+        remedy = "remove it, if no driver of this batch runs"
+        return {name: _checked(Owner, content, f"{self.own}/{name}", remedy) for name, content in self.own.load_below(names).items()}
+
+    @contextlib.contextmanager
+    def owned(self, shard: tuple[int, int] = (0, 1), *, numbered: bool = False, take_over: bool = False) -> Iterator[Location]:
+        """Drive the batch, or one shard of it, alone. Yields the owner's record, which is removed at the end unless somebody changed it.
+
+        Args:
+            numbered: a scheduler numbered this task, and runs every number once: what an earlier one left is taken over.
+            take_over: take over from any other driver.
+
+        Raises:
+            UsageError: another driver works on it, or may do so on another machine.
+        """
+        index, count = shard
+        name = "owner.json" if count == 1 else f"owner-{index}-of-{count}.json"
+        mine, me = self.own / name, Owner(host=this_host(), process=os.getpid(), since=time.time(), shard=shard)
+        content = me.model_dump_json().encode()
+        for _ in range(2):  # once more: two may have begun at the same moment
+            for other_name, other in self.owners().items():
+                beside = other_name != name and count > 1 and other.shard[1] == count
+                if beside or other == me:
+                    continue
+                alive = other.is_alive()
+                if alive is False or take_over or (numbered and other_name == name):
+                    (self.own / other_name).remove()
+                    continue
+                if mine.exists() and mine.load() == content:
+                    mine.remove()
+                raise UsageError("another driver works on this batch" if alive else "another machine may still drive this batch",
+                    where=str(self.own / other_name), got=str(other),
+                    remedy="wait for it, or stop it" if alive else "if it is gone, add --take-over")  # fmt: skip
+            if not mine.save(content, only_if_absent=True) and mine.load() != content:
+                raise UsageError("another driver works on this batch", where=str(mine), remedy="wait for it, or stop it")
+        try:
+            yield mine
+        finally:
+            with contextlib.suppress(InputError):
+                if mine.load() == content:
+                    mine.remove()

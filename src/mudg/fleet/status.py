@@ -1,0 +1,239 @@
+"""How far a batch is, from its records: steps by state, failures by reason, time and costs, and facts about the logs."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from mudg.base.errors import plain
+from mudg.base.memory import in_words
+from mudg.fleet.records import BatchFolder, CorpusFacts, Ended
+from mudg.fleet.work import REASONS
+
+_WINDOW_S: Final = 3600.0
+_SHOWN: Final = 12
+
+
+@dataclass(slots=True)
+class StageFigures:
+    """Figures of one step over all scenes. lost_s: processor seconds of attempts without a result."""
+
+    done: int = 0
+    failed: int = 0
+    seconds: float = 0.0
+    processor_s: float = 0.0
+    lost_s: float = 0.0
+    written_bytes: int = 0
+    peak_bytes: int = 0
+    slowest: tuple[float, str] = (0.0, "")
+
+    def add(self, ended: Ended, is_done: bool) -> None:
+        """Count the end of a step."""
+        self.lost_s += ended.lost_s
+        if not is_done:
+            self.failed += 1
+            return
+        self.done += 1
+        self.seconds += ended.seconds
+        self.processor_s += ended.processor_s
+        self.written_bytes += ended.written_bytes
+        self.peak_bytes = max(self.peak_bytes, ended.peak_bytes or 0)
+        self.slowest = max(self.slowest, (ended.seconds, ended.scene))
+
+
+@dataclass
+class BatchStatus:
+    """The state of a batch at one moment. ends: times at which steps ended. price: of a core-hour."""
+
+    out: str
+    scenes: int
+    stages: dict[str, StageFigures]
+    price: float = 0.0
+    drivers: list[str] = field(default_factory=list)
+    failures: list[Ended] = field(default_factory=list)
+    logs: list[CorpusFacts] = field(default_factory=list)
+    ends: list[float] = field(default_factory=list)
+
+    @property
+    def finished(self) -> int:
+        """Scenes whose last step is done."""
+        return next(reversed(self.stages.values())).done
+
+    def left(self, name: str) -> int:
+        """Scenes that can still come to a step: all but those that failed before it."""
+        before = 0
+        for other, figures in self.stages.items():
+            if other == name:
+                break
+            before += figures.failed
+        return max(0, self.scenes - before - self.stages[name].done - self.stages[name].failed)
+
+    def steps_left(self) -> int:
+        """Steps that have no end yet and can have one."""
+        return sum(map(self.left, self.stages))
+
+    def rate(self) -> float:
+        """Steps that ended per second over the last hour of work, or the whole time if that is shorter."""
+        last = max(self.ends, default=0.0)
+        recent = [end for end in self.ends if end > last - _WINDOW_S]
+        span = max(recent) - min(recent) if recent else 0.0
+        return (len(recent) - 1) / span if span > 0 else 0.0
+
+    def forecast_s(self) -> float | None:
+        """Seconds until the rest is done at the present rate; None if nothing is known."""
+        left, rate = self.steps_left(), self.rate()
+        return 0.0 if left == 0 else left / rate if rate > 0 else None
+
+    def reasons(self) -> list[tuple[str, int, str]]:
+        """Reasons of failures with their number and an example, the most frequent first."""
+        groups: Counter[tuple[int, str]] = Counter()
+        examples: dict[tuple[int, str], str] = {}
+        for one in sorted(self.failures, key=lambda one: one.scene):
+            group = (one.code, one.words.split(";")[0][:80])
+            groups[group] += 1
+            examples.setdefault(group, f"{one.scene} {one.stage}")
+        return [(f"{code} {reason_of(code)}: {words}", count, examples[code, words]) for (code, words), count in groups.most_common()]
+
+    def costs(self) -> dict[str, dict[str, float]]:
+        """Core-hours and money so far, and of the rest, by step and in total."""
+        rows: dict[str, dict[str, float]] = {}
+        for name, one in self.stages.items():
+            hours = (one.processor_s + one.lost_s) / 3600
+            rest = hours / one.done * self.left(name) if one.done else 0.0
+            rows[name] = {"core_hours": hours, "lost_hours": one.lost_s / 3600, "core_hours_left": rest,
+                "money": hours * self.price, "money_left": rest * self.price}  # fmt: skip
+        rows["total"] = {key: sum(row[key] for row in rows.values()) for key in next(iter(rows.values()))}
+        return {name: {key: round(value, 4) for key, value in row.items()} for name, row in rows.items()}
+
+    def corpus(self) -> dict[str, Any]:
+        """Sums over the logs."""
+        objects: Counter[str] = Counter()
+        for log in self.logs:
+            objects.update(log.objects)
+        return {
+            "scenes": len(self.logs), "images": sum(log.images for log in self.logs),
+            "hours": round(sum(log.seconds for log in self.logs) / 3600, 4),
+            "kilometres": round(sum(log.metres for log in self.logs) / 1000, 4),
+            "cameras": {str(count): scenes for count, scenes in sorted(Counter(log.cameras for log in self.logs).items())},
+            "datasets": dict(Counter(log.dataset for log in self.logs).most_common()), "objects": dict(objects.most_common()),
+        }  # fmt: skip
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values."""
+        stages = {
+            name: {
+                "done": one.done, "failed": one.failed, "left": self.left(name), "seconds": round(one.seconds, 1),
+                "processor_s": round(one.processor_s, 1), "lost_s": round(one.lost_s, 1), "written_bytes": one.written_bytes,
+                "peak_bytes": one.peak_bytes, "slowest": one.slowest[1],
+            }
+            for name, one in self.stages.items()
+        }  # fmt: skip
+        return {
+            "out": self.out, "scenes": self.scenes, "finished": self.finished, "left": self.steps_left(), "stages": stages,
+            "reasons": [{"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()],
+            "steps_per_hour": round(self.rate() * 3600, 2), "forecast_s": self.forecast_s(), "costs": self.costs(), "price": self.price,
+            "corpus": self.corpus(), "drivers": self.drivers,
+        }  # fmt: skip
+
+
+def reason_of(code: int) -> str:
+    """What an exit code of a step means."""
+    return REASONS.get(code, f"ended by signal {code - 128}" if code > 128 else f"exit code {code}")
+
+
+def read_status(folder: BatchFolder, price: float = 0.0) -> BatchStatus:
+    """Read the state of a batch. price: of a core-hour.
+
+    Raises:
+        InputError: no batch is there, or a record of it is damaged.
+    """
+    state = BatchStatus(str(folder.out), 0, {name: StageFigures() for name in folder.stages()}, price)
+    state.scenes = len(folder.scenes())
+    state.drivers = [str(owner) for owner in folder.owners().values()]
+    for is_done in (True, False):
+        for ended in folder.records("done" if is_done else "failed"):
+            if ended.stage in state.stages:
+                state.stages[ended.stage].add(ended, is_done)
+                state.ends.append(ended.ended)
+                if not is_done:
+                    state.failures.append(ended)
+                elif ended.facts is not None and ended.stage in ("run", "ingest"):
+                    state.logs.append(ended.facts)
+    return state
+
+
+def duration_text(seconds: float | None) -> str:
+    """A duration for people."""
+    if seconds is None:
+        return "unknown"
+    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+HEADS: Final = ("step", "done", "failed", "left", "seconds each", "most memory", "written", "core-hours", "lost", "still needed")
+
+
+def stage_rows(state: BatchStatus) -> list[tuple[str, ...]]:
+    """One row per step, and a total of the costs where a price is known."""
+    rows, costs, money = [], state.costs(), bool(state.price)
+    for name, one in state.stages.items():
+        cost = costs[name]
+        rows.append((
+            name, str(one.done), str(one.failed), str(state.left(name)), f"{one.seconds / one.done:.1f}" if one.done else "",
+            in_words(one.peak_bytes) if one.peak_bytes else "", in_words(one.written_bytes) if one.written_bytes else "",
+            f"{cost['core_hours']:.3f}", f"{cost['lost_hours']:.3f}", f"{cost['core_hours_left']:.3f}",
+        ))  # fmt: skip
+    if money:
+        total = costs["total"]
+        rows.append((f"cost at {state.price:g}", *[""] * 6, f"{total['money']:.2f}", "", f"{total['money_left']:.2f}"))
+    return rows
+
+
+def text_of(state: BatchStatus) -> str:
+    """The status as tables for a terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    grid = Table(title=f"{state.out}: {state.scenes} scenes", title_justify="left")
+    for column in HEADS:
+        grid.add_column(column, justify="left" if column == "step" else "right")
+    for row in stage_rows(state):
+        grid.add_row(*row)
+    out = io.StringIO()
+    Console(file=out, width=120, markup=False, highlight=False).print(grid)
+    for words, count, example in state.reasons()[:_SHOWN]:
+        out.write(f"{count:7d} x {plain(words)}  (e.g. {plain(example)})\n")
+    out.writelines(f"driven by {driver}\n" for driver in map(plain, state.drivers))
+    return out.getvalue() + _lead(state)
+
+
+def _lead(state: BatchStatus) -> str:
+    return (f"{state.finished} of {state.scenes} scenes are finished, {state.steps_left()} steps are left; {state.rate() * 3600:.1f} steps "
+        f"an hour, forecast for the rest: {duration_text(state.forecast_s())}")  # fmt: skip
+
+
+def page_of(state: BatchStatus) -> str:
+    """The status as a page, with figures of the logs."""
+    from mudg.base import html
+
+    corpus = state.corpus()
+    return html.render(
+        "batch.html.j2", title="Batch", kicker="mudg batch", heading=state.out, lead=f"{_lead(state)}.", drivers=state.drivers,
+        funnel=[(name, one.done, one.failed, state.scenes) for name, one in state.stages.items()], heads=HEADS, rows=stage_rows(state),
+        slowest=[(name, one.slowest[1], f"{one.slowest[0]:.1f} s") for name, one in state.stages.items() if one.done],
+        reasons=state.reasons(), failures=state.failures[:500], failed=len(state.failures),
+        figures=[
+            ("Logs", str(corpus["scenes"])), ("Hours driven", f"{corpus['hours']:.2f}"),
+            ("Kilometres driven", f"{corpus['kilometres']:.2f}"), ("Images", str(corpus["images"])),
+            ("Tracked objects", str(sum(corpus["objects"].values()))),
+        ],
+        cameras=[(name, str(count)) for name, count in corpus["cameras"].items()],
+        datasets=[(name, str(count)) for name, count in list(corpus["datasets"].items())[:30]],
+        objects=[(name, str(count)) for name, count in list(corpus["objects"].items())[:40]],
+        at=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+    )  # fmt: skip

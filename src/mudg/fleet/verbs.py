@@ -1,0 +1,135 @@
+"""``mudg batch run``, ``mudg batch status`` and ``mudg batch retry``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from mudg.steps.annotate import Annotate
+from mudg.steps.command import words_of
+from mudg.steps.fit import Fit
+from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Ingest
+from mudg.steps.render import RenderViews
+from mudg.steps.run import Run
+from mudg.steps.score import Score
+from mudg.steps.step import Flag, Step
+from mudg.steps.synthesize import Synthesize
+
+if TYPE_CHECKING:
+    from mudg.fleet.settings import BatchConfig
+    from mudg.steps.settings.presets import PresetName
+
+OUT = Flag("OUT", "first")
+
+
+class BatchRun(Step):
+    """Process a long list of logs, on this machine, Ray, Slurm or any scheduler, or go on with it."""
+
+    section = "many drives"
+    examples = (
+        "mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
+        "mudg batch run --list logs.txt --out /shared/runs --engine slurm --jobs 500 --slurm-options time=4:00:00 --config recipe.yaml",
+        "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine ray --ray-address auto --cpus 4 --gpus 1",
+    )
+    smaller = "fewer --jobs, or smaller images (--set ingest.resolution=960)"
+    short = ("stages", "command", "engine", "jobs", "cpus", "gpus")
+    list: Annotated[str, Flag("FILE|URL")]
+    """File with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Sources may be addresses."""
+    out: Annotated[str, Flag("FOLDER|URL")]
+    """Folder, or address in an object store (s3://bucket/runs), for results and records."""
+    config: Annotated[Path | None, Flag("FILE.yaml")] = None
+    """Settings of the steps: a file of mudg run."""
+    preset: PresetName = "default"
+    """Settings of the steps to start from, as for mudg run."""
+    set: Annotated[tuple[str, ...], Flag("STEP.NAME=VALUE ...")] = ()
+    """Settings of the steps, over those of --config, as fit.iterations=500 device=cpu."""
+    scratch: Path | None = None
+    """Folder for unfinished results and fetched inputs (not given: in --out if that is a folder, else the system's)."""
+    dry_run: bool = False
+    """Only say what there is to do."""
+    shard: Annotated[str, Flag("I/N")] = ""
+    """Only the I-th of N parts of the list, from 0. env, env/N: the I-th as the scheduler numbers this task (SLURM_ARRAY_TASK_ID,
+    JOB_COMPLETION_INDEX, SKYPILOT_NODE_RANK or AWS_BATCH_JOB_ARRAY_INDEX)."""
+    wait: bool = False
+    """With --engine slurm, wait for the end of the job."""
+    take_over: bool = False
+    """Go on although a driver on another machine may still work on the batch."""
+    settings: BatchConfig
+
+    @classmethod
+    def verb(cls) -> str:
+        return "batch run"
+
+    @classmethod
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> BatchConfig:
+        """The settings of the batch itself; a file holds those of its steps."""
+        return super().settings_from(inputs, None, given)
+
+    def act(self) -> dict[str, Any]:
+        from mudg.fleet import batch
+
+        settings = batch.settings_of(self.preset, self.config, self.set)
+        request = batch.BatchRequest(
+            self.list, self.out, self.settings, settings, stage_lines(), self.shard, self.wait, self.scratch, self.take_over
+        )
+        return batch.run(request, self.dry_run)
+
+
+def stage_lines() -> dict[str, tuple[str, ...]]:
+    """Command lines of the steps that a batch can do for each of its scenes, with names of other steps for their results."""
+    scene = {"scene": "{scene}", "fused": "{fuse}"}
+    steps = (
+        Run.build({"source": "{source}", "out": "{out}"}), Ingest.build({"log": "{source}", "out": "{out}"}),
+        Annotate.build({"scene": "{scene}", "out": "{out}"}), Fuse.build({"scene": "{scene}", "out": "{out}"}),
+        Fit.build({**scene, "out": "{out}"}, {"method": "street_gaussians"}),
+        Synthesize.build({**scene, "fitted": "{fit}", "out": "{out}"}),
+        RenderViews.build({"scene": "{scene}", "model": "{fit}", "out": "{out}"}),
+        Score.build({**scene, "views": {"fit": "{render}"}, "out": "{out}"}),
+    )  # fmt: skip
+    return {step.verb(): tuple(words_of(step)) for step in steps}
+
+
+class BatchProgress(Step):
+    """Show how far a batch is, what failed and what it took."""
+
+    section = "many drives"
+    examples = ("mudg batch status runs --html --price 0.04",)
+    out: Annotated[str, OUT]
+    """Folder or address of a batch."""
+    html: bool = False
+    """Also write OUT/status.html, with figures of the logs."""
+    watch_s: float = 0.0
+    """Show it again every so many seconds, until nothing is left (0 = once)."""
+    price: float = 0.0
+    """Price of one core-hour."""
+
+    @classmethod
+    def verb(cls) -> str:
+        return "batch status"
+
+    def act(self) -> dict[str, Any]:
+        from mudg.fleet import batch
+
+        return batch.show_status(self.out, self.html, self.price, self.watch_s)
+
+
+class BatchRetry(Step):
+    """Forget failures of a batch, so that the next run tries them again."""
+
+    section = "many drives"
+    examples = ("mudg batch retry runs --reason 5,137",)
+    out: Annotated[str, OUT]
+    """Folder or address of a batch."""
+    reason: str = ""
+    """Only these exit codes or reasons, with commas, e.g. 5,137 (empty = all)."""
+
+    @classmethod
+    def verb(cls) -> str:
+        return "batch retry"
+
+    def act(self) -> dict[str, Any]:
+        from mudg.fleet import batch
+
+        return batch.retry(self.out, self.reason)

@@ -1,0 +1,1 @@
+"""Logs and Gaussians of other programs: importers, exporters, Gaussian files."""

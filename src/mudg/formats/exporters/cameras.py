@@ -1,0 +1,213 @@
+"""Cameras and images of a log as a COLMAP model, binary or text, with one rig of all cameras.
+
+Poses are camera from world, axes x right, y down, z forward, pixel centres at 0.5: those of this program. Images that the rig took at one
+time and whose poses agree with it are one frame; any other image is a frame by itself, so that every image has exactly its own pose.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, store
+from mudg.base.types import Frame, PointCloud, Scene
+from mudg.formats.splats import ply
+from mudg.scene.files import open_files
+
+# names and bytes of a log's pictures for data sets of cameras ---------------------------------------------------------
+
+
+def picture_names(scene: Scene) -> dict[str, str]:
+    """Frame id -> ``images/CAMERA/NUMBER.ending``."""
+    return {frame.id: f"images/{frame.id}{PurePosixPath(frame.image.path).suffix}" for frame in scene.frames}
+
+
+def pictures(scene: Scene) -> Iterator[tuple[str, bytes]]:
+    """Name and bytes of every picture as the scene holds it."""
+    files, names = open_files(scene.root), picture_names(scene)
+    for frame in scene.frames:
+        yield names[frame.id], files.read(frame.image.path)
+
+
+# nerfstudio -----------------------------------------------------------------------------------------------------------
+#
+# Cameras and images of a log as a nerfstudio data set: ``transforms.json``, pictures, starting points.
+#
+# Poses are camera-to-world with x right, y up, z back; the world is that of this program, z up.
+
+
+FLIP: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+POINTS: Final = "points.ply"
+
+
+def nerfstudio_files(scene: Scene, points: PointCloud | None = None) -> dict[str, bytes]:
+    """All files but the pictures, which stand at ``picture_names``."""
+    names, frames = picture_names(scene), []
+    for frame in scene.frames:
+        view, camera = frame.view, frame.view.camera
+        frames.append({
+            "file_path": names[frame.id], "transform_matrix": (view.world_from_cam @ FLIP).tolist(), "time": view.time_s,
+            "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
+            "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+        })  # fmt: skip
+    test = [names[frame.id] for frame in scene.frames if scene.split.get(frame.id) == "test"]
+    value = {"camera_model": "OPENCV", "applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
+    if test:
+        kept = [names[frame.id] for frame in scene.frames if scene.split.get(frame.id) != "test"]
+        value |= {"train_filenames": kept, "val_filenames": test, "test_filenames": test}
+    files = {}
+    if points is not None:
+        value["ply_file_path"] = POINTS
+        files[POINTS] = points_ply(points)
+    return {"transforms.json": (store.json_text(value) + "\n").encode(), **files}
+
+
+def points_ply(points: PointCloud) -> bytes:
+    """Coloured points as a PLY file."""
+    rows = np.zeros(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = points.xyz, points.rgb
+    columns = [*(("float", axis) for axis in "xyz"), *(("uchar", color) for color in ("red", "green", "blue"))]
+    return ply.header([("vertex", len(points), columns)]) + rows.tobytes()
+
+
+# colmap ---------------------------------------------------------------------------------------------------------------
+
+
+PINHOLE: Final = 1
+CAMERA: Final = 0
+AGREE: Final = 1e-6
+"""Metres (and entries of rotations) by which poses of one frame may differ from those of its rig."""
+FOLDER: Final = "sparse/0"
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigFrame:
+    """Images that one pose of the rig explains."""
+
+    rig_from_world: Matrix
+    frames: tuple[Frame, ...]
+
+
+def sensors_from_rig(scene: Scene) -> dict[str, Matrix]:
+    """Pose of every camera in the rig, whose frame is that of the first camera: from the first image of each and the vehicle's path."""
+    cam_from_ego = {}
+    for frame in scene.frames:
+        name = frame.view.camera.name
+        if name not in cam_from_ego:
+            pose = scene.ego.pose_at(frame.view.time_s)
+            cam_from_ego[name] = frame.view.cam_from_world @ (np.eye(4) if pose is None else pose)
+    first = next(iter(cam_from_ego.values()), np.eye(4))
+    return {name: pose @ geometry.invert(first) for name, pose in cam_from_ego.items()}
+
+
+def rig_frames(scene: Scene, sensors: Mapping[str, Matrix]) -> list[RigFrame]:
+    """The images by frame of the rig, in order of time."""
+    found: list[RigFrame] = []
+    for frame in sorted(scene.frames, key=lambda one: one.view.time_s):
+        pose = geometry.invert(sensors[frame.view.camera.name]) @ frame.view.cam_from_world
+        last = found[-1] if found else None
+        taken = set() if last is None else {other.view.camera.name for other in last.frames}
+        together = last is not None and abs(last.frames[0].view.time_s - frame.view.time_s) < 1e-6
+        if (
+            last is not None
+            and together
+            and frame.view.camera.name not in taken
+            and np.abs(last.rig_from_world - pose).max() < AGREE
+        ):
+            found[-1] = RigFrame(last.rig_from_world, (*last.frames, frame))
+        else:
+            found.append(RigFrame(pose, (frame,)))
+    return found
+
+
+def colmap_files(scene: Scene, points: PointCloud | None = None, text: bool = False) -> dict[str, bytes]:
+    """The files of the model; pictures stand at ``picture_names``, below the folder ``images``."""
+    cameras = {name: index + 1 for index, name in enumerate(scene.cameras)}
+    images = {frame.id: index + 1 for index, frame in enumerate(scene.frames)}
+    sensors = sensors_from_rig(scene)
+    frames = rig_frames(scene, sensors)
+    write = _text if text else _binary
+    return {
+        f"{FOLDER}/{name}": content
+        for name, content in write(scene, (cameras, images, sensors, frames), points).items()
+    }
+
+
+Numbered = tuple[Mapping[str, int], Mapping[str, int], Mapping[str, Matrix], list[RigFrame]]
+
+
+def _pose(matrix: Matrix) -> list[float]:
+    """Quaternion w x y z and translation."""
+    return [*geometry.quaternion_from_matrix(matrix).tolist(), *matrix[:3, 3].tolist()]
+
+
+def _name(names: Mapping[str, str], frame: Frame) -> str:
+    return names[frame.id].removeprefix("images/")
+
+
+def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[str, bytes]:
+    cameras, images, sensors, frames = numbered
+    names = picture_names(scene)
+    lens = [
+        struct.pack("<IiQQ4d", cameras[c.name], PINHOLE, c.width, c.height, *c.intrinsics)
+        for c in scene.cameras.values()
+    ]
+    taken = [
+        struct.pack("<I7dI", images[frame.id], *_pose(frame.view.cam_from_world), cameras[frame.view.camera.name])
+        + _name(names, frame).encode() + b"\0" + struct.pack("<Q", 0)
+        for frame in scene.frames
+    ]  # fmt: skip
+    others = list(sensors)[1:]
+    first = next(iter(sensors), None)
+    rig = b"" if first is None else struct.pack("<IIiI", 1, len(sensors), CAMERA, cameras[first])
+    rig += b"".join(struct.pack("<iIB7d", CAMERA, cameras[name], 1, *_pose(sensors[name])) for name in others)
+    moments = [
+        struct.pack("<II7dI", index + 1, 1, *_pose(one.rig_from_world), len(one.frames))
+        + b"".join(struct.pack("<iIQ", CAMERA, cameras[f.view.camera.name], images[f.id]) for f in one.frames)
+        for index, one in enumerate(frames)
+    ]  # fmt: skip
+    cloud = np.zeros(0 if points is None else len(points), [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"),
+                                                            ("track", "<u8")])  # fmt: skip
+    if points is not None:
+        cloud["id"], cloud["xyz"], cloud["rgb"] = np.arange(1, len(points) + 1), points.xyz, points.rgb
+    parts = {"cameras.bin": lens, "images.bin": taken, "rigs.bin": [rig] if rig else [], "frames.bin": moments}
+    files = {name: struct.pack("<Q", len(entries)) + b"".join(entries) for name, entries in parts.items()}
+    return files | {"points3D.bin": struct.pack("<Q", len(cloud)) + cloud.tobytes()}
+
+
+def _text(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[str, bytes]:
+    cameras, images, sensors, frames = numbered
+    names = picture_names(scene)
+
+    def words(*values: object) -> str:
+        return " ".join(f"{value:.17g}" if isinstance(value, float) else str(value) for value in values)
+
+    lens = [
+        words(cameras[c.name], "PINHOLE", c.width, c.height, *map(float, c.intrinsics)) for c in scene.cameras.values()
+    ]
+    taken = [
+        words(images[f.id], *_pose(f.view.cam_from_world), cameras[f.view.camera.name], _name(names, f)) + "\n"
+        for f in scene.frames
+    ]
+    rig: list[str] = []
+    if sensors:
+        first, *others = sensors
+        rest = [word for name in others for word in ("CAMERA", cameras[name], 1, *_pose(sensors[name]))]
+        rig.append(words(1, len(sensors), "CAMERA", cameras[first], *rest))
+    moments = [
+        words(index + 1, 1, *_pose(one.rig_from_world), len(one.frames),
+              *(word for f in one.frames for word in ("CAMERA", cameras[f.view.camera.name], images[f.id])))
+        for index, one in enumerate(frames)
+    ]  # fmt: skip
+    rows = [] if points is None else zip(points.xyz.astype(np.float64).tolist(), points.rgb.tolist())
+    cloud = [words(index + 1, *xyz, *rgb, 0) for index, (xyz, rgb) in enumerate(rows)]
+    parts = {"cameras.txt": lens, "images.txt": taken, "rigs.txt": rig, "frames.txt": moments, "points3D.txt": cloud}
+    return {name: ("\n".join(lines) + "\n" if lines else "").encode() for name, lines in parts.items()}

@@ -1,0 +1,313 @@
+"""A driving log as an NCore recording (version 4), written with NVIDIA's package: NAME.ncore4.zarr.itar and NAME.ncore4.json.
+
+Frames: ``world``, ``rig`` (the vehicle) and one per sensor. A sensor whose place on the vehicle is fixed hangs on ``rig`` by one pose, any
+other on ``world`` by its own path. Times are whole microseconds; the first record of the log is at 1 s. Sweeps, which the scene holds as
+seen at one moment, are taken apart again into rays in the sensor's frame at their own times. Boxes stand in ``world``.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, log, store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Frame, Scene, Sweep, Track
+from mudg.base.versions import version
+from mudg.formats.exporters.log_records import LogRecords, picture_format
+from mudg.formats.ncore import (
+    ABOUT,
+    EGO_MASK,
+    INSTANCE,
+    MARK,
+    MICRO,
+    POINT_CLASSES,
+    RIG,
+    SWEEP_TIME,
+    WORLD,
+    Matrix,
+    PoseKeys,
+    Times,
+    close,
+    euler_of,
+    package,
+)
+from mudg.formats.splats.bundle import file_names
+from mudg.scene.labels import read_label
+
+FILES: Final = (f"*{MARK}.zarr.itar", f"*{MARK}.json")
+"""Names of what is written."""
+START_US: Final = MICRO
+"""Time of the first record: readers expect times that are not negative, and shutters open before."""
+FIXED_M: Final = 1e-6
+"""Metres (and entries of rotations) by which the place of a fixed sensor on the vehicle may vary."""
+_LONGEST_STEP_US: Final = 500_000
+"""Between the boxes of one object: readers split it where it is not seen for longer."""
+
+
+def write_ncore(folder: Path, records: LogRecords) -> list[Path]:
+    """Write a log into a folder, in a hidden folder there until it is complete; returns the files.
+
+    Raises:
+        ResourceError: the package is not installed. InputError: two sweeps or pictures of one sensor begin or end at one microsecond.
+    """
+    made = _WrittenLog(records)
+    name = file_names([records.scene.id])[0]
+    with tempfile.TemporaryDirectory(prefix=".ncore.", suffix=".part", dir=folder) as work:
+        found = [Path(work) / path.name for path in made.write(Path(work), name)]
+        files = [folder / path.name for path in found]
+        store.sync_tree(Path(work))
+        for temporary, path in zip(found, files, strict=True):
+            store.take_place(temporary, path)
+    return files
+
+
+class _WrittenLog:
+    """One log on its way into a recording."""
+
+    def __init__(self, records: LogRecords) -> None:
+        self._package = package()
+        self._log, self._scene = records, records.scene
+        if not len(self._scene.ego.times_s):
+            raise InputError("a recording needs the vehicle's path, and the scene has none", where=self._scene.id)
+        self._zero_us = START_US - round(records.start_s * MICRO)
+        self._frames = {name: list(self._scene.frames_of(name)) for name in self._scene.cameras}
+        self._sweeps: dict[str, list[Sweep]] = {}
+        for sweep in self._scene.sweeps:
+            self._sweeps.setdefault(sweep.sensor, []).append(sweep)
+        self._ids = sensor_ids(self._scene.cameras, self._sweeps)
+        self._spans = {sweep.id: self._span(sweep) for sweep in self._scene.sweeps}
+        self._start_us, self._end_us = self._interval()
+        ego = self._scene.ego
+        self._rig = self._keys(ego.times_s, lambda time_s: ego.pose_at(time_s)).covering(self._start_us, self._end_us)
+        self._mounts = records.mounts(FIXED_M)
+        self._paths = {
+            sensor: self._path(sensor)
+            for sensor in (*self._names("camera"), *self._names("lidar"))
+            if sensor not in self._mounts
+        }
+
+    def write(self, folder: Path, name: str) -> list[Path]:
+        """The files, in the order in which they take their place."""
+        interval = self._package.transformations.HalfClosedInterval.from_start_end(self._start_us, self._end_us)
+        writer = self._package.v4.SequenceComponentGroupsWriter(folder, name, self._scene.id, interval, self._about())
+        self._poses(writer)
+        self._calibration(writer)
+        with log.task("export", len(self._scene.frames) + len(self._scene.sweeps)) as bar:
+            for camera, frames in self._frames.items():
+                component = writer.register_component_writer(
+                    self._package.v4.CameraSensorComponent.Writer, self._ids[f"camera/{camera}"]
+                )
+                for frame in _in_order(frames, self._shutter, camera):
+                    content, kind = self._log.picture(frame), picture_format(frame)
+                    component.store_frame(content, kind, _unsigned(self._shutter(frame)), {}, {})
+                    bar.advance()
+            for lidar, sweeps in self._sweeps.items():
+                component = writer.register_component_writer(
+                    self._package.v4.LidarSensorComponent.Writer, self._ids[f"lidar/{lidar}"]
+                )
+                for sweep in _in_order(sweeps, lambda sweep: self._spans[sweep.id], lidar):
+                    self._sweep(component, sweep)
+                    bar.advance()
+        self._boxes(writer)
+        stores = [Path(str(path)) for path in writer.finalize()]
+        about = folder / f"{name}{MARK}.json"
+        reader = self._package.v4.SequenceComponentGroupsReader(stores)
+        store.write_text(about, store.json_text(reader.get_sequence_meta().to_dict()) + "\n")
+        close(reader)
+        return [*stores, about]
+
+    # -- times
+
+    def _us(self, time_s: float) -> int:
+        return round(time_s * MICRO) + self._zero_us
+
+    def _shutter(self, frame: Frame) -> tuple[int, int]:
+        """First and last microsecond of an image; its view is that of the middle."""
+        middle, half = self._us(frame.view.time_s), round(frame.view.camera.readout_s * MICRO / 2)
+        return middle - half, middle + half
+
+    def _span(self, sweep: Sweep) -> tuple[int, int]:
+        """First and last microsecond of a sweep; its own moment lies between."""
+        at, dt_s = self._us(sweep.time_s), self._log.points(sweep).dt_s
+        return (at, at) if not len(dt_s) else (at + min(0, _rounded(dt_s.min())), at + max(0, _rounded(dt_s.max())))
+
+    def _interval(self) -> tuple[int, int]:
+        spans = [*self._spans.values(), *(self._shutter(frame) for frame in self._scene.frames)]
+        times = [time for span in spans for time in span] + [self._us(float(time)) for time in self._scene.ego.times_s]
+        if not times or min(times) < 0:
+            raise InputError("times of points reach more than a second before the log", where=self._scene.id)
+        return min(times), max(max(times), min(times) + 1)
+
+    # -- poses
+
+    def _names(self, kind: str) -> list[str]:
+        return [name for name in self._ids if name.startswith(f"{kind}/")]
+
+    def _keys(self, times_s: Iterable[float], pose_at: Any) -> PoseKeys:
+        """Poses at whole microseconds, each once."""
+        keys: dict[int, Matrix] = {}
+        for time_s in times_s:
+            pose = pose_at(float(time_s))
+            keys.setdefault(self._us(float(time_s)), pose)
+        order = sorted(keys)
+        return PoseKeys(np.array(order, np.int64), np.stack([keys[at] for at in order]))
+
+    def _path(self, sensor: str) -> PoseKeys:
+        """The path in the world of a sensor that is not fixed; beyond its records it keeps its place on the vehicle."""
+        found = {self._us(time_s): pose for name, time_s, pose in self._log.sensor_poses() if name == sensor}
+        order = sorted(found)
+        for end, near in ((self._start_us, order[0]), (self._end_us, order[-1])):
+            if end not in found:
+                there, here = self._rig.at(np.array([end, near]))
+                found[end] = there @ geometry.invert(here) @ found[near]
+        order = sorted(found)
+        return PoseKeys(np.array(order, np.int64), np.stack([found[at] for at in order]))
+
+    def _sensor_at(self, sensor: str, times_us: Times) -> Matrix:
+        """World-from-sensor f64[N, 4, 4]."""
+        path = self._paths.get(sensor)
+        return self._rig.at(times_us) @ self._mounts[sensor] if path is None else path.at(times_us)
+
+    def _poses(self, writer: Any) -> None:
+        component = writer.register_component_writer(self._package.v4.PosesComponent.Writer, INSTANCE)
+        component.store_dynamic_pose(RIG, WORLD, self._rig.poses, self._rig.times_us.astype(np.uint64))
+        for sensor, name in self._ids.items():
+            if sensor in self._mounts:
+                component.store_static_pose(name, RIG, _exact(self._mounts[sensor]))
+            else:
+                path = self._paths[sensor]
+                component.store_dynamic_pose(name, WORLD, path.poses, path.times_us.astype(np.uint64))
+
+    # -- sensors
+
+    def _calibration(self, writer: Any) -> None:
+        intrinsics = writer.register_component_writer(self._package.v4.IntrinsicsComponent.Writer, INSTANCE)
+        masks = writer.register_component_writer(self._package.v4.MasksComponent.Writer, INSTANCE)
+        for name, camera in self._scene.cameras.items():
+            intrinsics.store_camera_intrinsics(self._ids[f"camera/{name}"], camera_model(self._package.data, camera))
+            masks.store_camera_masks(self._ids[f"camera/{name}"], _masks(self._scene, self._frames[name]))
+
+    def _sweep(self, component: Any, sweep: Sweep) -> None:
+        """Store the rays of a sweep."""
+        points, at = self._log.points(sweep), self._us(sweep.time_s)
+        times = at + np.round(points.dt_s.astype(np.float64) * MICRO).astype(np.int64)
+        raw = self._as_measured(sweep, points.xyz, times, at)
+        distance = np.linalg.norm(raw, axis=1)
+        ray = np.where(distance[:, None] > 0, raw / np.maximum(distance, 1e-12)[:, None], [1.0, 0.0, 0.0])
+        classes = {} if points.classes is None else {POINT_CLASSES: points.classes}
+        component.store_frame(
+            ray.astype(np.float32), times.astype(np.uint64), None, distance.astype(np.float32)[None],
+            points.intensity.clip(0, 1)[None], _unsigned(self._spans[sweep.id]), classes, {SWEEP_TIME: at},
+        )  # fmt: skip
+
+    def _as_measured(self, sweep: Sweep, xyz: NDArray[np.float32], times: Times, at: int) -> NDArray[np.float64]:
+        """Points f64[N, 3] in the sensor's frame at their own times."""
+        moments, which = np.unique(times, return_inverse=True)
+        if not len(moments) or (len(moments) == 1 and moments[0] == at):
+            return xyz.astype(np.float64)
+        poses = self._sensor_at(f"lidar/{sweep.sensor}", moments)
+        moved = np.linalg.inv(poses) @ sweep.world_from_lidar
+        return np.einsum("nij,nj->ni", moved[which, :3, :3], xyz.astype(np.float64)) + moved[which, :3, 3]
+
+    # -- objects
+
+    def _boxes(self, writer: Any) -> None:
+        source = self._package.data.LabelSource
+        kind = source.EXTERNAL if self._scene.source.recipe is None else source.GT_SYNTHETIC
+        found = [self._box(track, at, pose, kind) for track in self._scene.tracks for at, pose in self._keys_of(track)]
+        writer.register_component_writer(self._package.v4.CuboidsComponent.Writer, INSTANCE).store_observations(found)
+
+    def _box(self, track: Track, at: int, pose: Matrix, source: Any) -> Any:
+        data, (x, y, z), size = self._package.data, pose[:3, 3].tolist(), track.size_m.tolist()
+        box = data.BBox3((x, y, z), (size[0], size[1], size[2]), euler_of(pose[:3, :3]))
+        return data.CuboidTrackObservation(track.id, track.label, at, WORLD, at, box, source)
+
+    def _keys_of(self, track: Track) -> Iterator[tuple[int, Matrix]]:
+        """Poses of an object at its keys within the recording, at its ends where it reaches beyond, and where keys lie far apart."""
+        own = self._keys(track.times_s, track.pose_at)
+        first, last = max(int(own.times_us[0]), self._start_us), min(int(own.times_us[-1]), self._end_us)
+        if first > last:
+            return
+        inside = own.times_us[(own.times_us >= first) & (own.times_us <= last)].tolist()
+        times = sorted({first, last, *inside})
+        for before, after in zip(times[:-1], times[1:], strict=True):
+            parts = -(-(after - before) // _LONGEST_STEP_US)
+            times = [*times, *(before + (after - before) * part // parts for part in range(1, parts))]
+        times = sorted(set(times))
+        poses = own.at(np.array(times)) if len(own.times_us) > 1 else own.poses
+        yield from zip(times, poses, strict=True)
+
+    def _about(self) -> dict[str, Any]:
+        source = self._scene.source
+        return {
+            ABOUT: {
+                "version": version(),
+                "dataset": source.dataset,
+                "licence": source.licence,
+                "clock_zero_us": self._zero_us,
+            }
+        }
+
+
+def sensor_ids(cameras: Iterable[str], lidars: Iterable[str]) -> dict[str, str]:
+    """``camera/NAME`` and ``lidar/NAME`` -> the name of the sensor's frame, each once and apart from ``rig`` and ``world``."""
+    made: dict[str, str] = {}
+    for kind, names in (("camera", cameras), ("lidar", lidars)):
+        for name in names:
+            taken, chosen = {RIG, WORLD, *made.values()}, name
+            while chosen in taken:
+                chosen = f"{kind}_{chosen}"
+            made[f"{kind}/{name}"] = chosen
+    return made
+
+
+def camera_model(data: Any, camera: Camera) -> Any:
+    """The intrinsics of a pinhole camera, f32. A scene does not know which way a shutter rolls: downwards is written."""
+    shutter = data.ShutterType.ROLLING_TOP_TO_BOTTOM if camera.readout_s > 0 else data.ShutterType.GLOBAL
+    return data.OpenCVPinholeCameraModelParameters(
+        resolution=np.array([camera.width, camera.height], np.uint64), shutter_type=shutter, external_distortion_parameters=None,
+        principal_point=np.array([camera.cx, camera.cy], np.float32), focal_length=np.array([camera.fx, camera.fy], np.float32),
+        radial_coeffs=np.zeros(6, np.float32), tangential_coeffs=np.zeros(2, np.float32), thin_prism_coeffs=np.zeros(4, np.float32),
+    )  # fmt: skip
+
+
+def _masks(scene: Scene, frames: list[Frame]) -> dict[str, Any]:
+    """Where the own vehicle is seen, by most of the frames that say so."""
+    from PIL import Image
+
+    named = [frame for frame in frames if "ego" in frame.labels]
+    if not named:
+        return {}
+    seen = np.mean([read_label(scene, frame, "ego") for frame in named], axis=0) > 0.5
+    return {EGO_MASK: Image.fromarray(seen.astype(np.uint8) * 255)}
+
+
+def _in_order(records: list[Any], span: Any, sensor: str) -> list[Any]:
+    """Records of one sensor in order of time; InputError where two begin or end together."""
+    ordered = sorted(records, key=lambda record: span(record)[1])
+    spans = np.array([span(record) for record in ordered], np.int64).reshape(-1, 2)
+    if (np.diff(spans, axis=0) <= 0).any():
+        at = int(np.flatnonzero((np.diff(spans, axis=0) <= 0).any(1))[0])
+        raise InputError("two records of a sensor overlap so that neither is the earlier one", where=ordered[at + 1].id,
+            expected=f"one that begins and ends after {ordered[at].id}", got=f"{spans[at].tolist()} and {spans[at + 1].tolist()} us",
+            remedy=f"leave sensor {sensor} out of the scene")  # fmt: skip
+    return ordered
+
+
+def _exact(pose: Matrix) -> Matrix:
+    """A pose whose last row is 0 0 0 1 to the last bit."""
+    return geometry.from_rotation_translation(pose[:3, :3], pose[:3, 3])
+
+
+def _rounded(seconds: Any) -> int:
+    return round(float(seconds) * MICRO)
+
+
+def _unsigned(span: tuple[int, int]) -> NDArray[np.uint64]:
+    return np.array(span, np.uint64)

@@ -1,0 +1,347 @@
+"""Argoverse 2 importer: one log of the sensor data set.
+
+=========================================== =====================================================================
+``sensors/cameras/<camera>/<ns>.jpg``       images named by their time: seven ring cameras at 20 Hz, two stereo cameras
+``sensors/lidar/<ns>.feather``              sweeps at 10 Hz: x, y, z in the vehicle's frame, intensity, offset_ns
+``city_SE3_egovehicle.feather``             vehicle poses, at every sensor's times
+``calibration/*.feather``                   intrinsics, and where the sensors sit
+``annotations.feather``                     boxes in the vehicle's frame at the sweeps' times (not in the test split)
+=========================================== =====================================================================
+
+Images are rectified by the publisher: the coefficients k1 to k3 describe the original lens and are kept for the record only.
+Sweeps are the returns of two sensors, compensated for the vehicle's motion to the time in their name; ``dt_s`` is the file's
+``offset_ns``. They are stored in the frame of the upper sensor, so that a sweep has the origin its rays came from (the lower
+one sits about 0.1 m below it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log
+from mudg.base.errors import InputError
+from mudg.base.geometry import invert, transform_points
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
+from mudg.formats.importers import common, drive_log
+from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers.common import (
+    Columns,
+    ImportOptions,
+    arrow_files,
+    finite_columns,
+    require_columns,
+    returns_of,
+)
+from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.formats.importers.layout import (
+    LogFiles,
+    chosen_cameras,
+    folder_contents,
+    refuse_missing_cameras,
+    refuse_untwist,
+    the_only,
+)
+from mudg.formats.unknown_fields import note_unknown
+
+Matrix = NDArray[np.float64]
+
+LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
+RING_CAMERAS: Final = (
+    "ring_front_center", "ring_front_left", "ring_front_right", "ring_side_left", "ring_side_right",
+    "ring_rear_left", "ring_rear_right",
+)  # fmt: skip
+CAMERAS: Final[Mapping[str, str]] = {
+    "ring_front_center": "front", "ring_front_left": "front_left", "ring_front_right": "front_right",
+    "ring_side_left": "side_left", "ring_side_right": "side_right", "ring_rear_left": "rear_left",
+    "ring_rear_right": "rear_right", "stereo_front_left": "stereo_left", "stereo_front_right": "stereo_right",
+}  # fmt: skip
+SENSOR: Final = "lidar"
+_UPPER: Final = "up_lidar"
+_LOWER: Final = "down_lidar"
+NANOSECONDS: Final = 10**9
+_POSE_SLACK_S: Final = 0.02
+_MAX_OFFSET_NS: Final = 500_000_000
+_POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+SWEEPS: Final = "sensors/lidar/*.feather"
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
+    "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
+    "intrinsics.feather": frozenset({
+        "sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px",
+    }),
+    "annotations.feather": frozenset({
+        "timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE, "num_interior_pts", "log_id",
+    }),
+    SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
+}  # fmt: skip
+"""Tables -> their columns."""
+
+LABELS: Final[Mapping[str, str]] = {
+    "REGULAR_VEHICLE": "car", "PEDESTRIAN": "pedestrian", "OFFICIAL_SIGNALER": "pedestrian", "BICYCLE": "bicycle",
+    "BICYCLIST": "rider", "MOTORCYCLE": "motorcycle", "MOTORCYCLIST": "rider", "WHEELED_RIDER": "rider",
+    "WHEELED_DEVICE": "wheeled_device", "BUS": "bus", "SCHOOL_BUS": "bus", "ARTICULATED_BUS": "bus",
+    "LARGE_VEHICLE": "truck", "BOX_TRUCK": "truck", "TRUCK": "truck", "TRUCK_CAB": "truck",
+    "VEHICULAR_TRAILER": "trailer", "RAILED_VEHICLE": "tram", "STROLLER": "stroller", "WHEELCHAIR": "wheelchair",
+    "DOG": "animal", "ANIMAL": "animal", "BOLLARD": "bollard", "CONSTRUCTION_CONE": "traffic_cone",
+    "CONSTRUCTION_BARREL": "construction_barrel", "STOP_SIGN": "traffic_sign", "SIGN": "traffic_sign",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign", "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
+    "MESSAGE_BOARD_TRAILER": "message_board_trailer", "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
+}  # fmt: skip
+"""The data set's categories -> labels."""
+
+
+def looks_like_argoverse2(source: Path) -> bool:
+    """Whether a folder is an Argoverse 2 log, or holds some."""
+    return bool(_logs(source))
+
+
+def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one log into the scene directory ``out``; see the module text for what is read.
+
+    Args:
+        source: a log's folder, or a folder of logs.
+        options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images of
+            the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
+
+    Raises:
+        UsageError: there are several logs and none was chosen, or there is no such log or camera.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+        ResourceError: pyarrow, which reads Feather files, is not installed.
+    """
+    if not source.is_dir():
+        raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
+    refuse_untwist(options, "Argoverse 2", str(source))
+    return drive_log.write_log(read_log(_choose_log(source, options), options), out, options)
+
+
+def _logs(source: Path) -> list[Path]:
+    """Log folders: ``source`` itself, or its sub-folders."""
+    if not source.is_dir():
+        return []
+    if (source / "city_SE3_egovehicle.feather").is_file():
+        return [source]
+    return sorted(path.parent for path in source.glob("*/city_SE3_egovehicle.feather"))
+
+
+def _choose_log(source: Path, options: ImportOptions) -> Path:
+    logs = _logs(source)
+    if not logs:
+        raise InputError("no Argoverse 2 log found", where=str(source), got=folder_contents(source),
+            expected="city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders",
+            remedy="give the folder of one log of the sensor data set")  # fmt: skip
+    matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
+    return the_only(matching, [path.name for path in logs], options, source, "log")
+
+
+def files_of_argoverse2(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen log's folder."""
+    return LogFiles((_choose_log(source, options),))
+
+
+def read_log(folder: Path, options: ImportOptions) -> DriveLog:
+    """What the log's tables and file names tell; no image or sweep is opened."""
+    where = str(folder)
+    log.info(f"argoverse2: {folder}")
+    image_folder, sweep_folder = folder / "sensors" / "cameras", folder / "sensors" / "lidar"
+    there = {raw: name for raw, name in CAMERAS.items() if (image_folder / raw).is_dir()}
+    if not there:
+        raise InputError("the log has no images", where=str(image_folder),
+            expected="folders ring_front_center, ring_front_left, ... with images named by nanoseconds",
+            remedy="download the sensor data set's camera archives, too; a scene is made of images")  # fmt: skip
+    refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
+    chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
+    files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
+    scans = _files_by_time(sweep_folder, (".feather",)) if sweep_folder.is_dir() else {}
+    stamps = [stamp for found in (*files.values(), scans) for stamp in found]
+    if not stamps:
+        raise InputError("the log has no images", where=str(image_folder))
+    zero_ns = min(stamps)
+    ego_file, mount_file = (
+        folder / "city_SE3_egovehicle.feather",
+        folder / "calibration" / "egovehicle_SE3_sensor.feather",
+    )
+    notes: list[str] = []
+    mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
+    if options.skip_missing:
+        files = {name: _with_poses(found, ego, zero_ns, name) for name, found in files.items()}
+        scans = _with_poses(scans, ego, zero_ns, SENSOR)
+
+    def map_from_ego(stamp: int) -> Matrix:
+        return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, str(ego_file))
+
+    images = [
+        ImageRecord(name, (stamp - zero_ns) / NANOSECONDS, map_from_ego(stamp) @ mount, path)
+        for name, found in files.items()
+        for mount in [_of_sensor(mounts, chosen[name], mount_file)]
+        for stamp, path in found.items()
+    ]
+    upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
+    places = [pose[:3, 3] for name, pose in mounts.items() if name in (_UPPER, _LOWER)]
+    sweeps = [
+        SweepRecord(
+            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper, places)
+        )
+        for t, path in scans.items()
+    ]
+    notes += [] if sweeps else ["no LiDAR sweeps in the log"]
+    tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns, skip_missing=options.skip_missing)
+    cameras = read_cameras(folder / "calibration" / "intrinsics.feather", chosen)
+    source = Source("argoverse2", LICENCE, None, (*notes, *track_notes))
+    name = folder.resolve().name
+    return DriveLog(name, cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+
+
+def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """Files called by nanoseconds, in order of time."""
+    found = sorted(
+        (int(path.stem), path) for path in folder.iterdir() if path.stem.isdigit() and path.suffix.lower() in suffixes
+    )
+    common.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
+    return dict(found)
+
+
+def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: str) -> dict[int, Path]:
+    """The files at whose times the vehicle's path is known."""
+    placed = {t: path for t, path in files.items() if common.has_pose(ego, (t - zero_ns) / NANOSECONDS, _POSE_SLACK_S)}
+    if len(placed) < len(files):
+        log.warn(f"argoverse2: left out {len(files) - len(placed)} files of {sensor} without a vehicle pose")
+    return placed
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+
+def read_feather(path: Path, columns: Sequence[str]) -> Columns:
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
+
+    Raises:
+        ResourceError: pyarrow is not installed.
+        InputError: missing, cut off, without one of the columns, or with empty values.
+    """
+    with arrow_files(path):
+        import pyarrow.feather
+
+        if not path.is_file():
+            raise InputError("file not found", where=str(path), remedy="is the log complete?")
+        table = pyarrow.feather.read_table(str(path), memory_map=False)
+        require_columns(columns, table.schema.names, path)
+        kind = path.name if path.name in OFFICIAL else SWEEPS
+        note_unknown(kind, table.schema.names, OFFICIAL[kind])
+        empty = [name for name in columns if table.column(name).null_count]
+        if empty:
+            raise InputError("table has rows without a value", where=f"{path}: {', '.join(empty)}")
+        return {name: table.column(name).to_numpy() for name in columns}
+
+
+def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
+    stamps = columns["timestamp_ns"]
+    if stamps.dtype.kind not in "iu":
+        raise InputError("time stamps are not whole numbers", where=f"{where}: timestamp_ns", got=str(stamps.dtype))
+    stamps = stamps.astype(np.int64)
+    common.check_epoch(stamps, NANOSECONDS, f"{where}: timestamp_ns")
+    return stamps
+
+
+def _poses(columns: Columns, where: str) -> list[Matrix]:
+    rows = finite_columns(columns, _POSE, where)
+    return [common.pose_from_quaternion(row[:4], row[4:], f"{where}: row {index}") for index, row in enumerate(rows)]
+
+
+def read_ego(path: Path, zero_ns: int) -> EgoPath:
+    """Vehicle poses in the city's frame; times in seconds since ``zero_ns``."""
+    columns = read_feather(path, ("timestamp_ns", *_POSE))
+    stamps = _stamps(columns, str(path))
+    if len(stamps) == 0:
+        raise InputError("table of vehicle poses is empty", where=str(path))
+    return common.ego_path([(int(t) - zero_ns) / NANOSECONDS for t in stamps], _poses(columns, str(path)))
+
+
+def read_mounts(path: Path) -> dict[str, Matrix]:
+    """Sensor name -> ego-from-sensor f64[4, 4]."""
+    columns = read_feather(path, ("sensor_name", *_POSE))
+    return dict(zip(map(str, columns["sensor_name"]), _poses(columns, str(path)), strict=True))
+
+
+def _of_sensor(calibration: Mapping[str, Any], sensor: str, where: object) -> Any:
+    if sensor not in calibration:
+        raise InputError("calibration lacks a sensor", where=str(where), expected=sensor, got=", ".join(calibration))
+    return calibration[sensor]
+
+
+def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
+    """Cameras by scene name. Pixel centres are whole numbers in the data set: half a pixel is added here.
+
+    ``distortion`` is the original lens in OpenCV's order (k1, k2, p1, p2, k3); the images are rectified.
+    """
+    where = str(path)
+    names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
+    columns = read_feather(path, ("sensor_name", *names))
+    rows = dict(zip(map(str, columns["sensor_name"]), finite_columns(columns, names, where).tolist(), strict=True))
+    cameras = {}
+    for name, raw in chosen.items():
+        fx, fy, cx, cy, k1, k2, k3, width, height = _of_sensor(rows, raw, where)
+        lens = (k1, k2, 0.0, 0.0, k3)
+        cameras[name] = Camera(name, int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, distortion=lens)
+    return cameras
+
+
+def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = False) -> tuple[list[Track], list[str]]:
+    """Tracks in the city's frame, and notes; no file is no tracks. ``skip_missing`` leaves out boxes without a vehicle pose."""
+    where = str(path)
+    if not path.is_file():
+        return [], ["no annotations in this log: everything counts as static"]
+    names = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
+    columns = read_feather(path, names)
+    stamps, poses = _stamps(columns, where), _poses(columns, where)
+    sizes = finite_columns(columns, ("length_m", "width_m", "height_m"), where)
+    map_from_ego = {
+        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where)
+        for t in set(stamps)
+        if not skip_missing or common.has_pose(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S)
+    }
+    tracks = BoxTracks(where, LABELS)
+    for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        if int(stamp) not in map_from_ego:
+            continue
+        label = tracks.label_of(str(columns["category"][row]))
+        length, width, height = sizes[row].tolist()
+        time_s = (int(stamp) - zero_ns) / NANOSECONDS
+        track = str(columns["track_uuid"][row])
+        pose = map_from_ego[int(stamp)] @ pose
+        tracks.add(track, label, time_s, (length, width, height), pose, where=f"{where}: row {row}")
+    return tracks.tracks()
+
+
+def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()) -> SweepPoints:
+    """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
+
+    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it, f64[3] each.
+
+    Raises:
+        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
+    """
+    where = str(path)
+    columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
+    returns = returns_of(columns, where, places)
+    columns = {name: values[returns] for name, values in columns.items()}
+    xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
+    intensity = finite_columns(columns, ("intensity",), where)[:, 0]
+    offset_ns = columns["offset_ns"]
+    if offset_ns.dtype.kind not in "iu" or (
+        len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
+    ):
+        raise InputError("point times are no nanoseconds of one turn", where=f"{where}: offset_ns",
+            expected="whole nanoseconds since the sweep's time, under half a second",
+            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")  # fmt: skip
+    if len(intensity) and (intensity.min() < 0 or intensity.max() > 255):
+        raise InputError("intensity is out of range", where=where, expected="0 to 255",
+            got=f"{intensity.min():g} to {intensity.max():g}")  # fmt: skip
+    xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
+    dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
+    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s, no_returns=int((~returns).sum()))

@@ -1,0 +1,585 @@
+"""What importers share: work over items in parallel, units of time, poses that must be rigid, and the vehicle's path.
+
+A typical importer reads what is small, checks it, and hands the rest to the writer item by item::
+
+    times_s = seconds(raw_times, "us", where)                     # refuses milliseconds called microseconds
+    fits = {name: fit_images(camera, options, lens) for ...}      # images.py: rectified and resized in one place
+    content = SceneContent(name, source, fits, items, convert, item_name, ego)
+    return write_scene(content, out, options)                     # drive_log.py
+
+The scene is the same for any number of workers: frames and sweeps are ordered by time when all are there.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mudg import native
+from mudg.base import log
+from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
+from mudg.base.geometry import (
+    from_rotation_translation,
+    invert,
+    matrix_from_quaternion,
+    pose_at,
+    transform_points,
+    yaw_matrix,
+    yaw_of,
+)
+from mudg.base.types import EgoPath
+from mudg.scene import motion
+from mudg.scene.clouds import is_return, near_places
+
+# columns --------------------------------------------------------------------------------------------------------------
+#
+# Foreign tables and records: columns that must be there, numbers that must be finite, and the pyarrow package behind some files.
+
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+def require_columns(names: Iterable[str], there: Iterable[str], where: object) -> None:
+    """Refuse a table that lacks one of ``names``."""
+    there, names = list(there), list(names)
+    if not set(names) <= set(there):
+        raise InputError("table lacks columns", where=str(where), got=", ".join(sorted(there)[:40]) or "no columns",
+            expected=", ".join(names), remedy="is this a file of another data set, version or kind?")  # fmt: skip
+
+
+def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
+    """Columns as f64[n, k].
+
+    Raises:
+        InputError: no numbers, or not all finite.
+    """
+    where = f"{where}: {', '.join(names)}"
+    try:
+        table = np.stack([columns[name].astype(np.float64) for name in names], 1)
+    except (TypeError, ValueError) as error:
+        raise InputError("column does not hold numbers", where=where, got=str(error)[:120]) from error
+    bad = ~np.isfinite(table).all(1)
+    if bad.any():
+        raise InputError("column holds values that are not finite", where=where,
+            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}")  # fmt: skip
+    return table
+
+
+def returns_of(columns: Columns, where: object, places: Iterable[NDArray[np.float64]] = ()) -> NDArray[np.bool_]:
+    """Rows of a cloud's columns x, y, z that are returns of a beam: by their numbers, and not at one of the sensors' ``places``."""
+    try:
+        xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
+    except (TypeError, ValueError) as error:
+        raise InputError("column does not hold numbers", where=f"{where}: x, y, z", got=str(error)[:120]) from error
+    return is_return(xyz) & ~near_places(xyz, places)
+
+
+@contextmanager
+def record_fields(what: str, where: object, expected: str) -> Iterator[None]:
+    """Code that takes a foreign record apart: what is missing or of another type becomes an InputError ``what``."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise InputError(what, where=str(where), got=repr(error)[:120], expected=expected) from error
+
+
+@contextmanager
+def arrow_files(path: Path) -> Iterator[None]:
+    """Code that reads a Feather or Parquet file with pyarrow.
+
+    Raises:
+        ResourceError: pyarrow is not installed.
+        InputError: the file is damaged or cut off.
+    """
+    try:
+        import pyarrow
+    except ImportError as error:
+        raise ResourceError("Feather and Parquet files need pyarrow, which is not installed", where=str(path),
+            remedy="pip install 'mudg[data]'") from error  # fmt: skip
+    try:
+        yield
+    except (pyarrow.ArrowException, OSError, MemoryError, StopIteration, UnicodeDecodeError) as error:
+        raise InputError("table cannot be read, or is cut off", where=str(path), remedy="copy the file again",
+            got=str(error)[:200] or "it ends early") from error  # fmt: skip
+
+
+# options --------------------------------------------------------------------------------------------------------------
+#
+# What a user may choose when importing a log; every importer reads the same options and says which it cannot honour.
+
+
+Resolution = int | tuple[int, int]
+"""Longest side in pixels, or width and height."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportOptions:
+    """Options of an import.
+
+    Args:
+        frames: source frame numbers ``(first, end)``, end not included; None takes all.
+        cameras: the dataset's camera names; empty takes the importer's default.
+        sequence: which sequence or frame of a folder that holds many.
+        poses, boxes: files to use instead of those found by looking.
+        skip_missing: leave out frames of which an image, scan or vehicle pose is missing, instead of refusing.
+        bridge_gaps: lay curves through gaps between vehicle poses, instead of refusing the frames in them.
+        untwist: undo the distortion of scans by the vehicle's motion; auto decides by what the dataset documents.
+        test_every: hold out every n-th frame of all cameras (n, 2n, ...); 0 holds out none.
+        resolution: size of the scene's images; None keeps the recorded one. See ``images.ImageFit``.
+        workers: threads that convert frames; 0 = as many as there are processors to use. Results do not depend on it.
+    """
+
+    frames: tuple[int, int] | None = None
+    cameras: tuple[str, ...] = ()
+    sequence: str = ""
+    poses: Path | None = None
+    boxes: Path | None = None
+    skip_missing: bool = False
+    bridge_gaps: bool = False
+    untwist: Literal["auto", "yes", "no"] = "auto"
+    test_every: int = 4
+    resolution: Resolution | None = None
+    workers: int = 1
+
+
+def parse_frame_range(text: str) -> tuple[int, int] | None:
+    """``"10:26"`` -> (10, 26); an empty text -> None.
+
+    Raises:
+        UsageError: not of this form, or empty.
+    """
+    if not text:
+        return None
+    match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
+    if match is None or int(match[1]) >= int(match[2]):
+        raise UsageError("frame range makes no sense", where="--frames",
+            expected="FIRST:END with FIRST < END, e.g. 0:16", got=text)  # fmt: skip
+    return int(match[1]), int(match[2])
+
+
+def parse_resolution(text: str) -> Resolution | None:
+    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None.
+
+    Raises:
+        UsageError: not of this form, or below 16 pixels.
+    """
+    if not text:
+        return None
+    match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
+    sides = [int(side) for side in match.groups() if side] if match is not None else []
+    if not sides or min(sides) < 16:
+        raise UsageError("image size makes no sense", where="--resolution",
+            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels", got=text)  # fmt: skip
+    return sides[0] if len(sides) == 1 else (sides[0], sides[1])
+
+
+def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[str, Literal["train", "test"]]:
+    """Every ``test_every``-th moment (4, 8, 12, ... for 4; never the first) is held out, all cameras together.
+
+    Args:
+        frame_ids_by_time: ids of the frames of each moment, in time order.
+        test_every: 0 holds out none.
+    """
+    return {
+        frame_id: "test" if test_every > 0 and index > 0 and index % test_every == 0 else "train"
+        for index, frame_ids in enumerate(frame_ids_by_time)
+        for frame_id in frame_ids
+    }
+
+
+# common ---------------------------------------------------------------------------------------------------------------
+
+
+Item = TypeVar("Item")
+Matrix = NDArray[np.float64]
+TimeUnit = Literal["ns", "us", "ms", "s"]
+
+UNITS_PER_SECOND: Final[dict[str, int]] = {"ns": 10**9, "us": 10**6, "ms": 10**3, "s": 1}
+PLAUSIBLE_PERIOD_S: Final = (2e-3, 20.0)
+"""Typical time between two records of one sensor; outside of it the unit is taken to be wrong."""
+POSE_TOLERANCE: Final = 1e-3
+QUATERNION_TOLERANCE: Final = 1e-2
+MAX_EXTRAPOLATION_S: Final = 0.15
+_DESKEW_STEPS: Final = 32
+MAX_SPEED_M_S: Final = 100.0
+_SPEED_OVER_S: Final = 0.05
+_LEAST_UPRIGHT: Final = 0.5
+_DRIVES_M_S: Final = 1.0
+_LEAST_ALONG: Final = 0.8
+_COURSE_WITHIN_S: Final = 1.0
+_EPOCH_S: Final = (1e8, 4.1e9)
+"""Seconds since 1970 that a recording may carry: 1973 to 2099."""
+_MAX_LOG_S: Final = 4 * 3600.0
+
+
+# --- work over frames -------------------------------------------------------------------------------------------------
+
+
+def processors() -> int:
+    """Processors this process may use; MUDG_THREADS says otherwise."""
+    return native.default_threads()
+
+
+def for_each(
+    items: Iterable[Item],
+    work: Callable[[Item], None],
+    *,
+    title: str,
+    total: int | None = None,
+    workers: int = 1,
+    name: Callable[[Item], str] = str,
+) -> int:
+    """Do ``work`` on every item with a progress bar; at most two items per worker are in memory.
+
+    Args:
+        items: read lazily, by the calling thread: a generator over the records of a large file is fine.
+        work: called once per item, from several threads if ``workers`` > 1.
+        title: of the progress bar.
+        total: number of items; None = ``len(items)``, or unknown for a generator.
+        workers: threads; 1 = no threads, 0 = as many as there are processors to use.
+        name: what an item is called, put before the place of an error.
+
+    Returns:
+        Number of items.
+
+    Raises:
+        The error of the earliest failed item, its ``where`` completed by the item's name. No item is started after one
+        failed; those under way are waited for.
+    """
+    if total is None:
+        total = len(items) if isinstance(items, Sequence) else 0
+    workers = workers or processors()
+    done = 0
+    with log.task(title, total) as bar:
+        if workers == 1:
+            for item in items:
+                _named(work, item, name)
+                done += 1
+                bar.advance()
+            return done
+        with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
+            pending: deque[Future[None]] = deque()
+
+            def finish_first() -> None:
+                pending.popleft().result()
+                bar.advance()
+
+            try:
+                for item in items:
+                    pending.append(pool.submit(_named, work, item, name))
+                    done += 1
+                    if any(future.done() and future.exception() for future in pending):
+                        break
+                    if len(pending) == 2 * workers:
+                        finish_first()
+                while pending:
+                    finish_first()
+            finally:
+                for future in pending:
+                    future.cancel()
+    return done
+
+
+def foreign_numbers() -> np.errstate:
+    """Code that reads numbers of others: values that overflow or are none stay silent, because what comes out is checked. Holds in the
+    thread that enters it."""
+    return np.errstate(over="ignore", invalid="ignore")
+
+
+def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]) -> None:
+    try:
+        with foreign_numbers():
+            work(item)
+    except MudgError as error:
+        called = name(item)
+        if called in error.where:
+            raise
+        raise type(error)(
+            error.what, where=f"{called}: {error.where}" if error.where else called,
+            expected=error.expected, got=error.got, remedy=error.remedy,
+        ) from error  # fmt: skip
+
+
+# --- time -------------------------------------------------------------------------------------------------------------
+
+
+def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
+    """Times of one sensor's records as seconds f64[N] since ``start`` (same unit), checked.
+
+    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits.
+
+    Raises:
+        InputError: not increasing (with the first place), not finite, or so close or far apart that the unit is wrong.
+    """
+    numbers = np.asarray(times)
+    if numbers.dtype.kind not in "iuf" or numbers.ndim != 1 or not np.isfinite(numbers.astype(np.float64)).all():
+        raise InputError("timestamps are not a list of finite numbers", where=where, got=str(numbers)[:80])
+    if numbers.dtype.kind == "u":
+        numbers = numbers.astype(np.int64)
+    origin = int(start) if numbers.dtype.kind == "i" else start
+    since_start = (numbers - origin).astype(np.float64) / UNITS_PER_SECOND[unit]
+    steps = np.diff(since_start)
+    if (steps <= 0).any():
+        at = int(np.flatnonzero(steps <= 0)[0])
+        raise InputError("timestamps do not increase", where=f"{where}: record {at + 1}",
+            expected=f"later than {numbers[at]} {unit}", got=str(numbers[at + 1]),
+            remedy="sort the records by time, and remove doubled ones")  # fmt: skip
+    low, high = PLAUSIBLE_PERIOD_S
+    if len(steps) and not low <= (period := float(np.median(steps))) <= high:
+        raw = period * UNITS_PER_SECOND[unit]
+        fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
+        raise InputError("timestamps are in another unit than expected", where=where,
+            expected=f"{unit}; records {low:g} to {high:g} s apart", got=f"records {period:.3g} s apart",
+            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording")  # fmt: skip
+    return since_start
+
+
+def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> None:
+    """Refuse integer time stamps that are not since 1970 in the unit ``per_second`` (10**6 = microseconds)."""
+    unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
+    outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
+    if outside.any():
+        raise InputError("time stamp is in another unit", where=where, expected=f"{unit} since 1970",
+            got=f"{int(stamps[outside][0])}", remedy=f"convert the stamps to {unit}")  # fmt: skip
+    if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
+        raise InputError("time stamps of one log span more than hours", where=where,
+            got=f"{int(stamps.min())} to {int(stamps.max())}", expected=f"{unit}, all of one recording",
+            remedy="are records of another log, or of another unit, mixed in?")  # fmt: skip
+
+
+def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
+    """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to the earlier."""
+    return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
+
+
+# --- poses ------------------------------------------------------------------------------------------------------------
+
+
+def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
+    """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned.
+
+    Raises:
+        InputError: scaled (the factor is told), left-handed, not a rotation, or not finite.
+    """
+    numbers = np.asarray(matrix, np.float64)
+    if numbers.shape not in ((3, 4), (4, 4)):
+        raise InputError("pose has the wrong shape", where=where, expected="3x4 or 4x4 numbers", got=str(numbers.shape))
+    if not np.isfinite(numbers).all():
+        raise InputError("pose holds values that are not finite", where=where)
+    if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
+        got = numbers[3].tolist()
+        transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
+        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got),
+            remedy="it looks transposed: write it row by row" if transposed else "write it row by row")  # fmt: skip
+    return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
+
+
+def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
+    """The rotation nearest to f64[3, 3] numbers that were rounded; see ``rigid_pose``."""
+    u, stretch, vt = np.linalg.svd(matrix)
+    handed = float(np.linalg.det(u @ vt))
+    if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
+        raise InputError("pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
+            remedy="divide the rotation part by its scale; are the translations in metres?")  # fmt: skip
+    if np.abs(stretch - 1).max() > POSE_TOLERANCE:
+        raise InputError("pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
+            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}",
+            remedy="is it row-major, without shear or scale?")  # fmt: skip
+    if handed < 0:
+        raise InputError("pose is left-handed", where=where, expected="determinant +1",
+            got="a reflection (determinant -1)",
+            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras")  # fmt: skip
+    return u @ vt
+
+
+def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matrix:
+    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres.
+
+    Raises:
+        InputError: not finite, wrong count, or a quaternion whose length is not 1 within 1 %.
+    """
+    q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
+    if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
+        raise InputError("pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
+            got=f"{q.tolist()} and {t.tolist()}")  # fmt: skip
+    length = float(np.linalg.norm(q))
+    if abs(length - 1) > QUATERNION_TOLERANCE:
+        raise InputError("quaternion does not have length 1", where=where, expected="w, x, y, z of a rotation",
+            got=f"length {length:.6g}")  # fmt: skip
+    return from_rotation_translation(matrix_from_quaternion(q), t)
+
+
+def pose_near(
+    ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path"
+) -> Matrix:
+    """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
+
+    Raises:
+        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess (``motion.gap_at``).
+    """
+    inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
+    if inside is not None:
+        gap = motion.gap_at(ego, time_s)
+        if gap is not None:
+            raise gap_problem(gap, time_s, where)
+        return inside
+    first = time_s < ego.times_s[0]
+    beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
+    if beyond > max_beyond_s:
+        raise InputError("vehicle poses do not cover the images and scans", where=where, got=f"{beyond:.2f} s outside",
+            expected="poses from the first to the last frame",
+            remedy="are the clocks the same? is the file cut off, or of another log? --skip-missing leaves such records out")  # fmt: skip
+    if len(ego.times_s) == 1:
+        return ego.world_from_ego[0]
+    near, far = (0, 1) if first else (-1, -2)
+    step = float(abs(ego.times_s[far] - ego.times_s[near]))
+    if beyond > step:
+        return ego.world_from_ego[near]
+    # mirror the motion of the neighbouring interval: the pose at "beyond" before the end, turned around
+    back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
+    end = ego.world_from_ego[near]
+    return end if back is None else end @ invert(back) @ end
+
+
+def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
+    """The error about an image or scan in a gap of the vehicle's path."""
+    return InputError("vehicle poses have a gap here", where=where, got=f"at {time_s:.3f} s: {gap}",
+        expected="poses around every image and scan",
+        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps")  # fmt: skip
+
+
+def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> bool:
+    """Whether ``pose_near`` has a pose at a time."""
+    try:
+        pose_near(ego, time_s, max_beyond_s)
+    except InputError:
+        return False
+    return True
+
+
+def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPath:
+    """The vehicle's path with headings that flip by 180 degrees turned back and, if that is asked for, its gaps bridged.
+
+    Args:
+        options: ``bridge_gaps`` is used.
+        notes: what was done is added.
+    """
+    poses, turned = motion.unflipped(ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S)
+    if len(turned):
+        ego = EgoPath(ego.times_s, poses)
+        notes.append(
+            f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {len(turned)} of {len(poses)} poses were "
+            "turned back"
+        )
+    found = motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []
+    if found:
+        longest = max(found, key=lambda gap: gap.moved_m)
+        notes.append(f"{len(found)} gaps of the vehicle's path are bridged by curves, the longest: {longest}")
+        ego = motion.bridged(ego)
+    return ego
+
+
+def origin_note(map_from_ego: Matrix) -> str:
+    """A note that says where the scene's world lies in the data set's: its origin is the first vehicle pose, subtracted in float64."""
+    x, y, z = (float(value) for value in map_from_ego[:3, 3])
+    turn = yaw_of(map_from_ego)
+    return f"the world's origin is ({x:.3f}, {y:.3f}, {z:.3f}) m in the data set's world, its x axis turned by {turn:.6f} rad"
+
+
+def world_from_first(map_from_ego: Matrix) -> Matrix:
+    """The world whose origin is the first vehicle pose, its x axis along the first heading, its z axis the map's."""
+    return yaw_matrix(-yaw_of(map_from_ego)) @ from_rotation_translation(np.eye(3), -map_from_ego[:3, 3])
+
+
+def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
+    """Vehicle path in time order; of poses at one time (within a microsecond) the first is kept."""
+    times = np.asarray(stamps_s, np.float64)
+    order = np.argsort(times, kind="stable")
+    kept = order[np.r_[True, np.diff(times[order]) > 1e-6]]
+    return EgoPath(times[kept], np.stack([poses[i] for i in kept]))
+
+
+def check_motion(ego: EgoPath, where: str) -> None:
+    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are wrong then."""
+    upright = float(np.median(ego.world_from_ego[:, 2, 2]))
+    if upright < _LEAST_UPRIGHT:
+        raise InputError("the vehicle does not stand upright", where=where, expected="vehicle and map with z up",
+            got=f"its z axis rises by {upright:.2f} per metre",
+            remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
+    if len(ego.times_s) < 2:
+        return
+    # over a twentieth of a second at least: pose noise over less is no speed
+    later = np.minimum(np.searchsorted(ego.times_s, ego.times_s + _SPEED_OVER_S), len(ego.times_s) - 1)
+    pairs = np.flatnonzero(ego.times_s[later] - ego.times_s >= _SPEED_OVER_S)
+    first, last = (pairs, later[pairs]) if len(pairs) else (np.array([0]), np.array([len(ego.times_s) - 1]))
+    steps = ego.world_from_ego[last, :3, 3] - ego.world_from_ego[first, :3, 3]
+    speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
+    at = int(speed.argmax())
+    if speed[at] > MAX_SPEED_M_S:
+        raise InputError("the vehicle moves impossibly fast", where=where,
+            got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
+            expected=f"under {MAX_SPEED_M_S:.0f} m/s",
+            remedy="check the units of times and translations, and that all poses are of one log")  # fmt: skip
+    drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)  # over a gap it may turn
+    if drives.any():
+        forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
+        along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
+        if along < _LEAST_ALONG:
+            raise InputError("the vehicle does not drive where it looks", where=where,
+                expected="vehicle axes x forward, y left, z up",
+                got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
+                remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
+
+
+def deskew(
+    xyz: NDArray[np.float32], dt_s: NDArray[np.float32], world_from_lidar: Callable[[float], Matrix], time_s: float
+) -> NDArray[np.float32]:
+    """Bring points that were measured while the sensor moved to one moment.
+
+    Args:
+        xyz: f32[N, 3] metres, each in the sensor's frame at its own time.
+        dt_s: f32[N], that time less ``time_s``.
+        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, points in between are blended linearly.
+        time_s: the moment wanted.
+
+    Returns:
+        f32[N, 3] in the sensor's frame at ``time_s``.
+    """
+    if len(xyz) == 0 or not dt_s.any():
+        return xyz
+    low, high = float(dt_s.min()), float(dt_s.max())
+    moments = np.linspace(low, max(high, low + 1e-9), _DESKEW_STEPS + 1)
+    lidar_from_world = invert(world_from_lidar(time_s))
+    corrections = [lidar_from_world @ world_from_lidar(time_s + float(moment)) for moment in moments]
+    place = (dt_s.astype(np.float64) - low) / (moments[-1] - low) * _DESKEW_STEPS
+    return blend_motion(xyz.astype(np.float64), corrections, place).astype(xyz.dtype)
+
+
+def blend_motion(
+    points: NDArray[np.floating], corrections: Sequence[Matrix], place: NDArray[np.floating]
+) -> NDArray[Any]:
+    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly.
+
+    Args:
+        points: metres; computed in their type.
+        corrections: f64[4, 4] each, at least two.
+        place: [N] number of the correction, with its fraction: 2.5 is halfway between the third and the fourth.
+    """
+    step = np.clip(place.astype(int), 0, len(corrections) - 2)
+    out = np.empty_like(points)
+    for index in range(len(corrections) - 1):
+        chosen = step == index
+        if chosen.any():
+            share = (place[chosen] - index)[:, None]
+            before, after = (transform_points(corrections[n], points[chosen]) for n in (index, index + 1))
+            out[chosen] = before + share * (after - before)
+    return out

@@ -1,0 +1,718 @@
+"""Importer and checker of logs in the neutral layout (docs/custom_format.md), for recordings that no other importer reads."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import Field, WrapValidator
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, MudgError, UsageError
+from mudg.base.records import Number, StrictRecord, checked_by, named_by, parse_record, place
+from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
+from mudg.formats.importers import common
+from mudg.formats.importers.clouds import Cloud, read_cloud
+from mudg.formats.importers.common import (
+    UNITS_PER_SECOND,
+    ImportOptions,
+    deskew,
+    has_pose,
+    holdout_split,
+    mended_path,
+    nearest_index,
+    pose_near,
+)
+from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.images import Lens, brown_conrady, equidistant, fit_images, image_notes
+from mudg.formats.importers.layout import chosen_cameras, refuse_options
+from mudg.scene import check as scene_check
+from mudg.scene import schema
+from mudg.scene.check import Finding
+from mudg.scene.read import decode_image
+
+# schema ---------------------------------------------------------------------------------------------------------------
+#
+# ``log.json``, the index of a log in the neutral layout, as checked records. The layout is docs/custom_format.md.
+#
+# As in ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor`` collects all.
+
+
+Matrix = NDArray[np.float64]
+INDEX: Final = "log.json"
+FORMAT: Final = "mudg-log"
+VERSION: Final = 1
+LENSES: Final = {"brown_conrady": (brown_conrady, (4, 5, 8)), "equidistant": (equidistant, (4,))}
+"""Distortion models and how many coefficients they take."""
+
+
+# --- what log.json may hold ---------------------------------------------------------------------------------------------
+
+
+class QuaternionEntry(StrictRecord):
+    """A pose as a unit quaternion and a translation in metres."""
+
+    wxyz: list[Number]
+    xyz_m: list[Number]
+
+
+def _pose(value: Any, numbers: Any) -> Matrix:
+    """3 or 4 rows of 4 numbers (or 12 or 16 numbers), or ``{"wxyz": [...], "xyz_m": [...]}``, as f64[4, 4]."""
+    if isinstance(value, dict):
+        entry = parse_record(QuaternionEntry, value, "")
+        return common.pose_from_quaternion(entry.wxyz, entry.xyz_m, "")
+    try:
+        rows = schema.sixteen_numbers(value)
+    except InputError as problem:
+        expected = '3 or 4 rows of 4 numbers, or {"wxyz": [w, x, y, z], "xyz_m": [x, y, z]}'
+        raise InputError("pose is of no known form", got=problem.got, expected=expected) from problem
+    return common.rigid_pose(np.array(numbers(rows)).reshape(4, 4), "")
+
+
+def _time(value: Any, number: Any) -> Any:
+    """A time in the log's unit: whole numbers stay whole."""
+    number(value)
+    if isinstance(value, int) and abs(value) >= 1 << 62:
+        raise InputError("time makes no sense", got=str(value)[:40])
+    return value
+
+
+Pose = Annotated[list[Number], WrapValidator(checked_by(_pose))]
+"""Rigid, f64[4, 4]."""
+Time = Annotated[Number, WrapValidator(checked_by(_time))]
+
+
+class DistortionEntry(StrictRecord):
+    """A lens."""
+
+    model: Literal["brown_conrady", "equidistant"]
+    coefficients: list[Number]
+
+
+class LogCameraEntry(StrictRecord):
+    """A camera; ``cx`` and ``cy`` count from ``pixel_centre``."""
+
+    width: int
+    height: int
+    fx: Number
+    fy: Number
+    cx: Number
+    cy: Number
+    ego_from_camera: Pose
+    distortion: DistortionEntry | None = None
+    pixel_centre: Number = 0.0
+    readout_s: Number = 0.0
+
+
+class LogLidar(StrictRecord):
+    """A LiDAR: where it sits, which fields of its clouds mean what, and whether its sweeps are motion-compensated.
+
+    Args:
+        intensity_field: empty = clouds have no intensities.
+        intensity_max: intensities are divided by it.
+        time_field: empty = clouds have no times; else ``time_unit`` is their unit.
+        time_from: whether times of points count from the sweep's time or on the log's clock.
+    """
+
+    ego_from_sensor: Pose = Field(alias="ego_from_lidar")
+    motion_compensated: bool
+    intensity_field: str = "intensity"
+    intensity_max: Annotated[Number, Field(gt=0)] = 1.0
+    time_field: str = ""
+    time_unit: common.TimeUnit | None = None
+    time_from: Literal["sweep", "log"] = "sweep"
+
+
+class EgoPoseEntry(StrictRecord):
+    """One pose of the vehicle."""
+
+    time: Time
+    world_from_ego: Pose
+
+
+class LogImageEntry(StrictRecord):
+    """One image."""
+
+    camera: str
+    time: Time
+    file: schema.FileRef
+    world_from_camera: Pose | None = None
+
+
+class LogCloudEntry(StrictRecord):
+    """One cloud."""
+
+    lidar: str
+    time: Time
+    file: schema.FileRef
+
+
+class BoxEntry(StrictRecord):
+    """One box of a track."""
+
+    time: Time
+    world_from_object: Pose
+
+
+class LogTrackEntry(StrictRecord):
+    """One track."""
+
+    id: str
+    label: str = Field(alias="class")
+    size_m: schema.BoxSize
+    boxes: list[BoxEntry]
+
+
+class LogIndex(StrictRecord):
+    """The top of ``log.json``; the records of its lists and tables are checked one by one."""
+
+    format: str
+    version: int
+    name: schema.Name
+    licence: str
+    time_unit: common.TimeUnit
+    cameras: dict[str, Any]
+    ego: list[Any]
+    images: list[Any]
+    dataset: str = "custom"
+    lidars: dict[str, Any] = {}
+    sweeps: list[Any] = []
+    tracks: list[Any] = []
+
+
+# --- what a log holds -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogCamera:
+    """A camera as recorded, its lens (None = rectified images), and where it sits on the vehicle."""
+
+    camera: Camera
+    lens: Lens | None
+    ego_from_sensor: Matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogItem:
+    """One image or cloud: its sensor and where that sits, seconds since the start, file, its own pose if the log gives one."""
+
+    kind: Literal["image", "cloud"]
+    sensor: str
+    ego_from_sensor: Matrix
+    time_s: float
+    file: Ref
+    world_from_sensor: Matrix | None = None
+
+
+class LogClock(NamedTuple):
+    """Where seconds count from: the first vehicle pose, in the log's own unit, ``units_per_s`` units per second."""
+
+    unit: common.TimeUnit
+    start: float
+    units_per_s: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CustomLog:
+    """A parsed ``log.json``. Seconds count from the first vehicle pose; the world's origin is that pose's place.
+
+    ``origin_m`` f64[3] was taken from every position. Images and sweeps are in time order per sensor.
+    """
+
+    root: Path
+    name: str
+    source: Source
+    cameras: Mapping[str, LogCamera]
+    lidars: Mapping[str, LogLidar]
+    ego: EgoPath
+    images: tuple[LogItem, ...]
+    sweeps: tuple[LogItem, ...]
+    tracks: tuple[Track, ...]
+    clock: LogClock
+    origin_m: NDArray[np.float64]
+
+
+# --- parsing ------------------------------------------------------------------------------------------------------------
+
+
+def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
+    """Parse ``root/log.json``.
+
+    Args:
+        complain: called with each problem; a record with a problem is left out.
+
+    Raises:
+        InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised.
+    """
+    where = str(root / INDEX)
+    top = _parse_index(schema.parse_object(store.read_bytes(root / INDEX), where), where)
+    cameras = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)
+    lidars = schema.parse_table(top.lidars, f"{where}: lidars", _parse_lidar, complain)
+    if not cameras:
+        expected = "at least one camera by name"
+        complain(InputError("the log has no cameras", where=f"{where}: cameras", expected=expected))
+    if not top.ego:
+        raise InputError("the log has no vehicle poses", where=f"{where}: ego", expected="at least one")
+    path = schema.parse_each(
+        top.ego, f"{where}: ego", lambda value, at: parse_record(EgoPoseEntry, value, at), schema.raise_first
+    )
+    clock = LogClock(top.time_unit, path[0].time, common.UNITS_PER_SECOND[top.time_unit])
+    poses = np.stack([entry.world_from_ego for entry in path])
+    origin_m = poses[0, :3, 3].copy()
+    poses[:, :3, 3] -= origin_m
+    ego = EgoPath(common.seconds([entry.time for entry in path], clock.unit, f"{where}: ego", clock.start), poses)
+    reader = _LogReader(where, clock, origin_m, complain)
+    images = reader.items("images", top.images, LogImageEntry, top.cameras, cameras)
+    sweeps = reader.items("sweeps", top.sweeps, LogCloudEntry, top.lidars, lidars)
+    tracks = reader.tracks(top.tracks)
+    notes = ["read from the neutral layout"]
+    if np.abs(origin_m).max() > 0:
+        coordinates = ", ".join(f"{value:.3f}" for value in origin_m)
+        notes.append(f"world origin moved to the first vehicle position, ({coordinates}) in the log")
+    source = Source(top.dataset, top.licence, None, tuple(notes))
+    return CustomLog(
+        root, top.name, source, cameras, lidars, ego, tuple(images), tuple(sweeps), tuple(tracks), clock, origin_m
+    )
+
+
+def _parse_index(value: dict[str, Any], where: str) -> LogIndex:
+    found = value.get("format"), value.get("version")
+    if found != (FORMAT, VERSION):
+        what = "this is not the index of a log in the neutral layout"
+        expected = f'"format": "{FORMAT}", "version": {VERSION}'
+        raise InputError(what, where=where, expected=expected, got=f"{found[0]!r}, {found[1]!r}"[:80])
+    return parse_record(LogIndex, value, f"{where}: ")
+
+
+def _parse_camera(name: str, value: object, where: str) -> LogCamera:
+    entry = parse_record(LogCameraEntry, value, where)
+    if entry.pixel_centre not in (0.0, 0.5):
+        expected = "0 (the middle of the top-left pixel is (0, 0), as in OpenCV) or 0.5"
+        where, got = place(where, "pixel_centre"), f"{entry.pixel_centre:g}"
+        raise InputError("pixel centre makes no sense", where=where, expected=expected, got=got)
+    coefficients = entry.distortion.coefficients if entry.distortion is not None else []
+    plain = {key: getattr(entry, key) for key in ("width", "height", "fx", "fy", "readout_s")}
+    middle = {key: getattr(entry, key) + 0.5 - entry.pixel_centre for key in ("cx", "cy")}
+    camera = schema.parse_camera(name, {**plain, **middle, "distortion": coefficients}, where)
+    return LogCamera(camera, _lens(entry.distortion, place(where, "distortion")), np.asarray(entry.ego_from_camera))
+
+
+def _lens(entry: DistortionEntry | None, where: str) -> Lens | None:
+    if entry is None:
+        return None
+    make, counts = LENSES[entry.model]
+    if len(entry.coefficients) not in counts:
+        expected, got = " or ".join(str(count) for count in counts), str(len(entry.coefficients))
+        what = "distortion model takes another number of coefficients"
+        raise InputError(what, where=place(where, "coefficients"), expected=expected, got=got)
+    return make(*entry.coefficients) if any(entry.coefficients) else None
+
+
+def _parse_lidar(name: str, value: object, where: str) -> LogLidar:
+    schema.check_name(name, where)
+    lidar = parse_record(LogLidar, value, where)
+    if bool(lidar.time_field) != (lidar.time_unit is not None):
+        expected = f"time_field, and time_unit: one of {', '.join(common.UNITS_PER_SECOND)}"
+        raise InputError("times of points need their field and its unit", where=where, expected=expected)
+    return lidar
+
+
+class _LogReader:
+    """Parses records that depend on the log's clock and origin."""
+
+    def __init__(self, where: str, clock: LogClock, origin_m: NDArray[np.float64], complain: schema.Complain) -> None:
+        self.where, self.clock, self.origin_m, self.complain = where, clock, origin_m, complain
+
+    def seconds(self, times: list[Any], where: str) -> NDArray[np.float64]:
+        """Seconds since the start, checked."""
+        return common.seconds(times, self.clock.unit, where, self.clock.start)
+
+    def in_scene(self, pose: Any) -> Matrix:
+        """A pose in the log's world, moved to the scene's."""
+        moved = np.array(pose)
+        moved[:3, 3] -= self.origin_m
+        return moved
+
+    def items(
+        self,
+        kind: str,
+        values: list[Any],
+        entry_type: type[LogImageEntry] | type[LogCloudEntry],
+        declared: Iterable[str],
+        usable: Mapping[str, LogCamera] | Mapping[str, LogLidar],
+    ) -> list[LogItem]:
+        """Images or sweeps in time order per sensor; a sensor whose times are wrong is complained about and left out.
+
+        Args:
+            kind: ``images`` or ``sweeps``.
+            declared: names of all sensors of the log.
+            usable: those that were parsed; records of others are left out.
+        """
+        names = tuple(declared)
+        key, item_kind = ("camera", "image") if entry_type is LogImageEntry else ("lidar", "cloud")
+
+        def parse(value: object, where: str) -> tuple[str, Any]:
+            entry = parse_record(entry_type, value, where)
+            sensor = getattr(entry, key)
+            if sensor not in names:
+                what, expected = f"record names a {key} that the log does not have", ", ".join(names)
+                expected = expected or f"an entry in {key}s"
+                raise InputError(what, where=place(where, key), expected=expected, got=sensor[:80])
+            return sensor, entry
+
+        entries = schema.parse_each(values, f"{self.where}: {kind}", parse, self.complain)
+        found: list[LogItem] = []
+        for name, parsed in usable.items():
+            own = [entry for sensor, entry in entries if sensor == name]
+            where = f"{self.where}: {kind} of {name}"
+            if not own:
+                self.complain(InputError(f"{name} has no {kind}", where=where, remedy=f"add them, or remove {name}"))
+                continue
+            try:
+                times = self.seconds([entry.time for entry in own], where).tolist()
+            except InputError as problem:
+                self.complain(problem)
+                continue
+            mounted = np.asarray(parsed.ego_from_sensor)
+            for entry, time_s in zip(own, times, strict=True):
+                pose = getattr(entry, "world_from_camera", None)
+                placed = None if pose is None else self.in_scene(pose)
+                found.append(LogItem(item_kind, name, mounted, time_s, Ref(entry.file), placed))
+        return found
+
+    def tracks(self, values: list[Any]) -> list[Track]:
+        """Tracked boxes."""
+
+        def parse(value: object, where: str) -> Track:
+            entry = parse_record(LogTrackEntry, value, where)
+            times_s = self.seconds([box.time for box in entry.boxes], place(where, "boxes"))
+            poses = [self.in_scene(box.world_from_object) for box in entry.boxes]
+            with named_by(where):
+                return Track(entry.id, entry.label, np.array(entry.size_m), times_s, np.reshape(poses, (-1, 4, 4)))
+
+        tracks = schema.parse_each(values, f"{self.where}: tracks", parse, self.complain)
+        for twice in schema.repeated(track.id for track in tracks):
+            self.complain(InputError("two tracks have one id", where=f"{self.where}: tracks", got=twice))
+        return tracks
+
+
+# importer -------------------------------------------------------------------------------------------------------------
+
+
+MAX_ALIKE: Final = 5
+"""Findings with the same text that are listed one by one."""
+MAX_DELAY_S: Final = 1.0
+Numbered = tuple[int, LogItem]
+"""A record and its number, counted per sensor in time order."""
+
+
+def looks_like_custom(source: Path) -> bool:
+    """Whether ``source`` is a folder with the index of a log in the neutral layout."""
+    index = source / INDEX
+    if not index.is_file():
+        return False
+    with store.open_file(index) as handle:
+        return b'"mudg-log"' in handle.read(4096)
+
+
+def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import a log in the neutral layout into the scene directory ``out``.
+
+    Raises:
+        UsageError: an option that this format does not have, or a camera that the log does not have.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
+    read, notes = read_log(source), []
+    read = replace(read, ego=mended_path(read.ego, options, notes))
+    content = _chosen(read, options)
+    fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
+    images, sweeps = _numbered(content.images), _numbered(content.sweeps)
+    moments = _moments(content.images)
+    as_scene(content, _raise)  # records without a pose are refused before anything is read
+
+    def convert(item: Numbered) -> Iterator[SceneImage | SceneSweep]:
+        number, record = item
+        if record.kind == "image":
+            path = _file(content, record)
+            refuse_grey(path)
+            pose = pose_of(content.ego, record)
+            yield SceneImage(record.sensor, number, record.time_s, pose, path, moment=moments[record])
+        else:
+            points = read_sweep(content, record, options)
+            yield SceneSweep(record.sensor, number, record.time_s, pose_of(content.ego, record), points)
+
+    origin = replace(content.source, notes=(*content.source.notes, *notes, *image_notes(fits)))
+    scene = SceneContent(
+        content.name, origin, fits, [*images, *sweeps], convert, _id_of, content.ego, lambda: (content.tracks, ())
+    )
+    return write_scene(scene, out, options)
+
+
+def _raise(problem: MudgError) -> None:
+    raise problem
+
+
+def _id_of(item: Numbered) -> str:
+    return f"{item[1].sensor}/{item[0]:06d}"
+
+
+def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
+    """Image -> number of the image of the first camera that is nearest in time."""
+    if not images:
+        return {}
+    clock = np.array([image.time_s for image in images if image.sensor == images[0].sensor])
+    numbers = nearest_index(clock, np.array([image.time_s for image in images]))
+    return dict(zip(images, numbers.tolist(), strict=True))
+
+
+def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
+    """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the rest goes by time."""
+    there = {name: name for name in content.cameras}
+    names = chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
+    images = [image for image in content.images if image.sensor in names]
+    sweeps = list(content.sweeps)
+    if options.frames is not None:
+        clock = [image.time_s for image in images if image.sensor == names[0]]
+        window = clock[options.frames[0] : options.frames[1]]
+        if not window:
+            expected, got = f"0:{len(clock)}", str(options.frames)
+            raise UsageError("no frames in this range", where="--frames", expected=expected, got=got)
+        slack = float(np.median(np.diff(clock))) / 2 if len(clock) > 1 else 0.0
+        inside = (window[0] - slack - 1e-9, window[-1] + slack + 1e-9)
+        images = [image for image in images if inside[0] <= image.time_s <= inside[1]]
+        sweeps = [sweep for sweep in sweeps if inside[0] <= sweep.time_s <= inside[1]]
+    if options.skip_missing:
+        images, sweeps = _usable(content, images), _usable(content, sweeps)
+    cameras = {name: content.cameras[name] for name in names}
+    return replace(content, cameras=cameras, images=tuple(images), sweeps=tuple(sweeps))
+
+
+def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
+    """Records whose file is there and whose pose is known."""
+    found = [record for record in records if (content.root / record.file.path).is_file()]
+    if len(found) < len(records):
+        log.warn(f"custom: left out {len(records) - len(found)} records whose {records[0].kind} is missing")
+    placed = [r for r in found if r.world_from_sensor is not None or has_pose(content.ego, r.time_s)]
+    if len(placed) < len(found):
+        times = [r.time_s for r in found if r not in placed]
+        log.warn(
+            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from {min(times):.3f} to "
+            f"{max(times):.3f} s"
+        )
+    return placed
+
+
+def _numbered(records: Sequence[LogItem]) -> list[Numbered]:
+    counts: Counter[str] = Counter()
+    numbered = []
+    for record in records:
+        numbered.append((counts[record.sensor], record))
+        counts[record.sensor] += 1
+    return numbered
+
+
+# --- one record -------------------------------------------------------------------------------------------------------
+
+
+def _file(content: CustomLog, record: LogItem) -> Path:
+    path = content.root / record.file.path
+    if not path.resolve().is_relative_to(content.root.resolve()):
+        raise InputError("a link leads out of the log", where=str(path), expected="a file inside the log")
+    return path
+
+
+def pose_of(ego: EgoPath, record: LogItem) -> NDArray[np.float64]:
+    """World-from-sensor f64[4, 4] of an image or cloud: its own, else by the vehicle's path."""
+    if record.world_from_sensor is not None:
+        return record.world_from_sensor
+    return pose_near(ego, record.time_s) @ record.ego_from_sensor
+
+
+def refuse_grey(path: Path) -> None:
+    """Refuse grey images, which ``decode_image`` would take: in a log of colour cameras they are a mistake."""
+    try:
+        with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG", "JPEG")) as image:
+            mode = image.mode
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return  # decode_image says better what is wrong
+    if mode in ("1", "L", "LA"):
+        got, remedy = f"mode {mode}", "repeat the channel three times, if grey is meant"
+        raise InputError("image is grey", where=str(path), expected="8-bit RGB", got=got, remedy=remedy)
+
+
+def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
+    """The points of a sweep, motion-compensated to its time.
+
+    Raises:
+        InputError: no points, a field that was declared is not there, intensities above the declared largest one, points
+            that need their times and have none.
+    """
+    lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
+    cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
+    if len(cloud.xyz) == 0:
+        remedy = "export it again, or take the sweep out of log.json"
+        raise InputError("cloud has no points", where=str(path), expected="at least one return", remedy=remedy)
+    dt_s = _delays(cloud, sweep, content, path)
+    intensity = _intensity(cloud, lidar, sweep.sensor, path)
+    points = SweepPoints(cloud.xyz.astype(np.float32), intensity, dt_s, no_returns=cloud.missing)
+    if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
+        return points
+    if not lidar.time_field:
+        raise InputError(
+            "sweeps are not motion-compensated, and their points have no times",
+            where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected="time_field and time_unit",
+            remedy="name the field with the time of each point, or add --untwist no",
+        )  # fmt: skip
+
+    def world_from_lidar(time_s: float) -> NDArray[np.float64]:
+        return pose_near(content.ego, time_s) @ sweep.ego_from_sensor
+
+    return replace(points, xyz=deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s))
+
+
+def _field(cloud: Cloud, name: str, what: str, path: Path, remedy: str = "") -> NDArray[Any]:
+    """A declared field of a cloud, else InputError."""
+    values = cloud.fields.get(name)
+    if values is None:
+        got = ", ".join(cloud.fields) or "coordinates only"
+        raise InputError(f"cloud has no {what}", where=str(path), expected=f"a field {name!r}", got=got, remedy=remedy)
+    return values
+
+
+def _intensity(cloud: Cloud, lidar: LogLidar, name: str, path: Path) -> NDArray[np.float32]:
+    if not lidar.intensity_field:
+        return np.zeros(len(cloud.xyz), np.float32)
+    remedy = f"name the field in log.json: lidars.{name}.intensity_field; an empty text if there is none"
+    values = _field(cloud, lidar.intensity_field, "intensity", path, remedy)
+    scaled = np.nan_to_num(values.astype(np.float64) / lidar.intensity_max, nan=0.0)
+    if scaled.min() < 0 or scaled.max() > 1 + 1e-6:
+        expected, got = f"0 to {lidar.intensity_max:g}", f"{values[np.abs(scaled - 0.5).argmax()]:g}"
+        remedy = f"give the largest possible value in log.json: lidars.{name}.intensity_max (often 255)"
+        raise InputError("intensity is out of range", where=str(path), expected=expected, got=got, remedy=remedy)
+    return scaled.clip(0, 1).astype(np.float32)
+
+
+def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDArray[np.float32]:
+    """Seconds of each point relative to the sweep's time; 0 where clouds have no times."""
+    lidar, clock = content.lidars[sweep.sensor], content.clock
+    if not lidar.time_field or lidar.time_unit is None:
+        return np.zeros(len(cloud.xyz), np.float32)
+    values, per_second = _field(cloud, lidar.time_field, "times", path), UNITS_PER_SECOND[lidar.time_unit]
+    if lidar.time_from == "log":
+        # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
+        values = values.astype(np.int64) if values.dtype.kind == "u" else values
+        start = clock.start * per_second
+        start = start // clock.units_per_s if isinstance(start, int) else start / clock.units_per_s
+        dt_s = (values - np.asarray(start, values.dtype)).astype(np.float64) / per_second - sweep.time_s
+    else:
+        dt_s = values.astype(np.float64) / per_second
+    if not np.isfinite(dt_s).all() or np.abs(dt_s).max() > MAX_DELAY_S:
+        expected, got = f"within {MAX_DELAY_S:g} s", f"up to {np.abs(dt_s).max():.3g} s"
+        what, remedy = (
+            "times of points are far from their sweep's",
+            "check time_unit and time_from of the LiDAR in log.json",
+        )
+        raise InputError(what, where=str(path), expected=expected, got=got, remedy=remedy)
+    return dt_s.astype(np.float32)
+
+
+# --- checking -----------------------------------------------------------------------------------------------------------
+
+
+def check_log(source: Path) -> list[Finding]:
+    """Everything that is wrong or odd about a log in the neutral layout, worst first; every file is read.
+
+    Problems with the same text are listed five times, the rest counted.
+    """
+    findings: list[Finding] = []
+
+    def complain(problem: MudgError) -> None:
+        findings.append(scene_check.finding_of(problem, str(source)))
+
+    try:
+        content = read_log(source, complain)
+    except MudgError as problem:
+        complain(problem)
+        return scene_check.worst_first(findings)
+    scene, images, sweeps = as_scene(content, complain)
+    findings.extend(scene_check.check_records(scene))
+
+    def check_image(frame: Frame, image: LogItem) -> Iterator[Finding]:
+        path = _file(content, image)
+        refuse_grey(path)
+        pixels = decode_image(store.read_bytes(path), str(path), frame.view.camera)
+        yield from scene_check.check_image(frame, pixels)
+
+    def check_sweep(sweep: Sweep, cloud: LogItem) -> Iterator[Finding]:
+        points = read_sweep(content, cloud, ImportOptions())
+        if points.no_returns:
+            rows = points.no_returns + len(points.xyz)
+            yield Finding(
+                "note", f"sweep {sweep.id}", f"{points.no_returns} of {rows} points mark beams without a return; ingest leaves them out"
+            )
+        yield from scene_check.check_points(scene, sweep, points)
+
+    with log.task("checking images and sweeps", len(images) + len(sweeps)) as bar:
+        checks = [
+            *map(check_image, scene.frames, images),
+            *map(check_sweep, scene.sweeps, sweeps),
+        ]  # nothing is read yet
+        for check in checks:
+            findings.extend(scene_check.collected(check, str(source)))
+            bar.advance()
+    return scene_check.worst_first(_collapsed(findings))
+
+
+def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple[Scene, list[LogItem], list[LogItem]]:
+    """The log as a scene whose references are files of the log: nothing is copied; and the records of its frames and sweeps.
+
+    Records without a pose are complained about and left out. Cameras are as recorded.
+    """
+    frames: dict[LogItem, Frame] = {}
+    sweeps: dict[LogItem, Sweep] = {}
+    for item in (*_numbered(content.images), *_numbered(content.sweeps)):
+        record, name = item[1], _id_of(item)
+        try:
+            pose = pose_of(content.ego, record)
+            if record.kind == "image":
+                view = View(content.cameras[record.sensor].camera, pose, record.time_s)
+                frames[record] = Frame(name, view, record.file)
+            else:
+                sweeps[record] = Sweep(name, record.sensor, record.time_s, pose, record.file)
+        except InputError as problem:
+            complain(problem.located(f"{record.kind} {record.file.path}"))
+    groups: dict[int, list[str]] = {}
+    for record, moment in _moments(list(frames)).items():
+        groups.setdefault(moment, []).append(frames[record].id)
+    split = holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
+    cameras = {name: camera.camera for name, camera in content.cameras.items()}
+    scene = Scene(
+        content.name, str(content.root), cameras, tuple(frames.values()), tuple(sweeps.values()), content.tracks,
+        content.ego, split, content.source,
+    )  # fmt: skip
+    return scene, list(frames), list(sweeps)
+
+
+def _collapsed(findings: Iterable[Finding]) -> list[Finding]:
+    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more there are."""
+    counts: Counter[tuple[scene_check.Level, str]] = Counter()
+    kept = []
+    for finding in findings:
+        kind = (finding.level, finding.message.split(";")[0])
+        counts[kind] += 1
+        if counts[kind] <= MAX_ALIKE:
+            kept.append(finding)
+    more = [
+        Finding(level, "and others", f"{message}: {count - MAX_ALIKE} more")
+        for (level, message), count in counts.items()
+        if count > MAX_ALIKE
+    ]
+    return kept + more

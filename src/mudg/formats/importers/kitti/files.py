@@ -1,0 +1,553 @@
+"""KITTI vehicle poses: GPS/IMU packets (``oxts``), odometry pose files, velodyne pose files; and the clocks beside them."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log, store
+from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix, yaw_of
+from mudg.base.types import Camera, SweepPoints, Track
+from mudg.formats.importers.box_tracks import BoxTracks, box_size
+from mudg.formats.importers.clouds import read_float_rows
+from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation
+from mudg.formats.unknown_fields import note_unknown
+
+# scans ----------------------------------------------------------------------------------------------------------------
+#
+# KITTI velodyne scans: reading, and how the sensor turns while the vehicle drives.
+#
+# The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured a / 2 pi
+# turns later.
+
+
+SENSOR: Final = "velodyne"
+TURN_PERIOD_S: Final = 0.1
+_TURN_STEPS: Final = 36
+
+
+def read_scan(path: Path) -> SweepPoints:
+    """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
+
+    Raises:
+        InputError: cut off, or values that are not finite.
+    """
+    rows, returns = read_float_rows(path, 4)
+    rows = rows[returns]
+    dt_s = np.zeros(len(rows), np.float32)
+    no_returns = int((~returns).sum())
+    return SweepPoints(np.ascontiguousarray(rows[:, :3]), np.clip(rows[:, 3], 0, 1), dt_s, no_returns=no_returns)
+
+
+def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
+    """When the sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking forward."""
+    return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S
+
+
+def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float) -> SweepPoints:
+    """Bring the points of a turning sensor to one moment; see the module text for the timing.
+
+    Args:
+        points: as measured.
+        velo_at: world-from-velodyne f64[4, 4] at a time; asked at 37 moments of the turn, points in between are blended.
+        time_s: the scan's time.
+
+    Returns:
+        Points in the sensor's frame at ``time_s``, with the seconds after it at which they were measured.
+    """
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    dt_s = np.asarray(azimuth_delay_s(azimuth), np.float32)
+    velo_from_world = invert(velo_at(time_s))
+    moments_s = np.linspace(-0.5, 0.5, _TURN_STEPS + 1) * TURN_PERIOD_S
+    corrections = [velo_from_world @ velo_at(time_s + float(moment)) for moment in moments_s]
+    place = (dt_s / TURN_PERIOD_S + 0.5) * _TURN_STEPS
+    return replace(points, xyz=blend_motion(points.xyz, corrections, place), dt_s=dt_s)
+
+
+# calib ----------------------------------------------------------------------------------------------------------------
+#
+# KITTI calibration text, both forms: the object/tracking/odometry ``calib.txt`` and the three files of a raw-data day.
+#
+# KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the principal
+# point here, once.
+
+
+PIXEL_CENTRE_PX = 0.5
+_NUMBERED = tuple(f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4))
+_TEXT = frozenset({
+    "P0", "P1", "P2", "P3", "R0_rect", "R_rect", "Tr", "Tr_velo_to_cam", "Tr_velo_cam", "Tr_imu_to_velo", "Tr_imu_velo", "calib_time",
+})  # fmt: skip
+_OFFICIAL: Mapping[str, frozenset[str]] = {
+    "calib_cam_to_cam.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
+    "calib_velo_to_cam.txt": frozenset({"calib_time", "R", "T", "delta_f", "delta_c"}),
+    "calib_imu_to_velo.txt": frozenset({"calib_time", "R", "T"}),
+    "perspective.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
+    "calib_cam_to_pose.txt": frozenset({"image_00", "image_01", "image_02", "image_03"}),
+}
+"""Entries of the data sets' files, read or not; any other file is the calibration text of an object, a sequence or a drive."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiCalibration:
+    """Calibration of one recording.
+
+    Args:
+        projections: camera number -> P f64[3, 4]: pixels from rectified camera 0.
+        rect0_from_velo: rectified camera 0 from velodyne, f64[4, 4].
+        velo_from_imu: velodyne from IMU f64[4, 4], or None if the source does not say.
+        source: the files read, for messages.
+    """
+
+    projections: dict[int, Matrix]
+    rect0_from_velo: Matrix
+    velo_from_imu: Matrix | None
+    source: str
+
+    def camera(self, number: int, name: str, width: int, height: int) -> Camera:
+        """Pinhole intrinsics of the rectified camera ``number``."""
+        return pinhole_camera(self._projection(number), name, (width, height), f"{self.source}: P{number}")
+
+    def cam_from_rect0(self, number: int) -> Matrix:
+        """Rectified camera ``number`` from rectified camera 0: a translation only."""
+        projection = self._projection(number)
+        return from_rotation_translation(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
+
+    def velo_from_cam(self, number: int) -> Matrix:
+        """Velodyne from rectified camera ``number``, f64[4, 4]."""
+        return invert(self.cam_from_rect0(number) @ self.rect0_from_velo)
+
+    def _projection(self, number: int) -> Matrix:
+        if number not in self.projections:
+            raise InputError(f"calibration does not tell camera {number}", where=self.source,
+                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices")  # fmt: skip
+        return self.projections[number]
+
+
+def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: str) -> Camera:
+    """The rectified pinhole camera of a KITTI projection matrix.
+
+    Args:
+        projection: f64[3, 4]; pixels are counted from the centre of the top-left one.
+        name: of the camera in the scene.
+        size: width and height in pixels.
+        where: for messages.
+
+    Raises:
+        InputError: skew, another last row than 0 0 1, or a focal length that is not positive.
+    """
+    if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
+        raise InputError("projection matrix is not of a rectified pinhole camera", where=where,
+            expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))  # fmt: skip
+    fx, fy, cx, cy = (float(projection[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if fx <= 0 or fy <= 0:
+        raise InputError("focal length is not positive", where=where, expected="pixels, about 700 for KITTI",
+            got=f"fx={fx:g}, fy={fy:g}", remedy="check the calibration file")  # fmt: skip
+    return Camera(name, *size, fx, fy, cx + PIXEL_CENTRE_PX, cy + PIXEL_CENTRE_PX)
+
+
+def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
+    """``key: numbers`` lines of a KITTI text file; lines whose value is not numbers (dates) are left out.
+
+    The colon after the key is optional (some benchmark files leave it out for ``R_rect`` and ``Tr_velo_cam``).
+    """
+    table: dict[str, NDArray[np.float64]] = {}
+    for line in store.read_text(path).splitlines():
+        match = re.match(r"\s*([A-Za-z][\w]*)\s*:?\s+(.*)$", line)
+        if match is None:
+            continue
+        note_unknown(path.name, (match[1],), _OFFICIAL.get(path.name, _TEXT))
+        try:
+            numbers = np.array([float(text) for text in match[2].split()])
+        except ValueError:
+            continue
+        if not np.isfinite(numbers).all():
+            raise InputError("calibration holds a value that is not finite", where=f"{path}: {match[1]}",
+                got=match[2][:80])  # fmt: skip
+        table[match[1]] = numbers
+    return table
+
+
+def table_entry(
+    table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], shape: tuple[int, ...], where: object
+) -> Matrix:
+    """The first entry of ``keys`` that the table has, as an array of ``shape``.
+
+    Raises:
+        InputError: there is none of them, or it has another number of values.
+    """
+    key = next((key for key in keys if key in table), None)
+    if key is None:
+        raise InputError(f"calibration lacks {keys[0]}", where=str(where), expected=" or ".join(keys),
+            got=", ".join(table) or "no entries", remedy="use the calibration file that belongs to this recording")  # fmt: skip
+    if table[key].size != np.prod(shape):
+        raise InputError("calibration entry has the wrong number of values", where=f"{where}: {key}",
+            expected=f"{np.prod(shape)} numbers", got=f"{table[key].size}", remedy="is the file cut off?")  # fmt: skip
+    return table[key].reshape(shape)
+
+
+def read_calibration_text(path: Path) -> KittiCalibration:
+    """Object, tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
+    table = read_number_table(path)
+    projections = {n: table_entry(table, (f"P{n}",), (3, 4), path) for n in range(4) if f"P{n}" in table}
+    rectify, rectify_keys, imu_keys = np.eye(3), ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
+    if any(key in table for key in rectify_keys):
+        rectify = rigid_rotation(table_entry(table, rectify_keys, (3, 3), path), f"{path}: R0_rect")
+    velo_to_cam = table_entry(table, ("Tr_velo_to_cam", "Tr_velo_cam", "Tr"), (3, 4), path)
+    velo_to_cam = rigid_pose(velo_to_cam, f"{path}: Tr_velo_to_cam")
+    velo_from_imu = None
+    if any(key in table for key in imu_keys):
+        velo_from_imu = rigid_pose(table_entry(table, imu_keys, (3, 4), path), f"{path}: Tr_imu_to_velo")
+    rect0_from_velo = from_rotation_translation(rectify, np.zeros(3)) @ velo_to_cam
+    return KittiCalibration(projections, rect0_from_velo, velo_from_imu, str(path))
+
+
+def read_calibration_day(folder: Path) -> KittiCalibration:
+    """Raw-data calibration of one day: ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt``, ``calib_imu_to_velo.txt``."""
+    path = folder / "calib_cam_to_cam.txt"
+    table = read_number_table(path)
+    projections = {n: table_entry(table, (f"P_rect_0{n}",), (3, 4), path) for n in range(4) if f"P_rect_0{n}" in table}
+    rectify = rigid_rotation(table_entry(table, ("R_rect_00",), (3, 3), path), f"{path}: R_rect_00")
+    rect0_from_velo = from_rotation_translation(rectify, np.zeros(3)) @ _pose_file(folder / "calib_velo_to_cam.txt")
+    imu_path = folder / "calib_imu_to_velo.txt"
+    velo_from_imu = _pose_file(imu_path) if imu_path.is_file() else None
+    return KittiCalibration(projections, rect0_from_velo, velo_from_imu, str(folder))
+
+
+def _pose_file(path: Path) -> Matrix:
+    """Rotation ``R`` and translation ``T`` of a raw-data file as a pose f64[4, 4]."""
+    table = read_number_table(path)
+    rotation = rigid_rotation(table_entry(table, ("R",), (3, 3), path), f"{path}: R")
+    return from_rotation_translation(rotation, table_entry(table, ("T",), (3,), path))
+
+
+# poses ----------------------------------------------------------------------------------------------------------------
+
+
+Matrix = NDArray[np.float64]
+EARTH_RADIUS_M = 6378137.0
+_OXTS_VALUES = 30
+
+
+def read_lines(path: Path) -> dict[int, str]:
+    """The lines of a text file by their number, from 0. An empty one is a record that is missing: it is left out, and keeps its number."""
+    return {number: line for number, line in enumerate(store.read_text(path).splitlines()) if line.strip()}
+
+
+def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDArray[np.float64]:
+    """The numbers of one line; their count must be one of ``counts``."""
+    try:
+        numbers = np.array([float(text) for text in line.split()])
+    except ValueError as error:
+        raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
+    if len(numbers) not in counts:
+        raise InputError(f"{what}: wrong number of values", where=where, expected=" or ".join(str(c) for c in counts),
+            got=str(len(numbers)), remedy="is the file cut off, or of another format?")  # fmt: skip
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{what}: a value is not finite", where=where, got=line.strip()[:80],
+            expected="finite numbers")  # fmt: skip
+    return numbers
+
+
+def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, Matrix], str]:
+    """Poses by frame number, and which sensor they are of.
+
+    Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
+    for frame number k (or, in a file that has just one line per frame, for the k-th frame); 13 = frame number, then
+    row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose.
+
+    Returns:
+        Poses f64[4, 4] by frame number, and ``"cam0"`` or ``"velo"``.
+    """
+    lines = read_lines(path)
+    if not lines:
+        raise InputError("pose file is empty", where=str(path), expected="one pose a line")
+    rows = {n: line_numbers(line, (12, 13), f"{path}: line {n + 1}", "pose") for n, line in lines.items()}
+    widths, count = {len(row) for row in rows.values()}, max(rows) + 1
+    if len(widths) != 1:
+        raise InputError("pose file mixes two forms", where=str(path), expected="12 or 13 numbers in every line")
+    if widths == {13}:
+        poses = {int(row[0]): row[1:] for row in rows.values()}
+        if len(poses) != len(rows) or any(number != row[0] for number, row in zip(poses, rows.values(), strict=True)):
+            raise InputError("first column is not a list of distinct frame numbers", where=str(path))
+    elif count > max(frame_numbers):
+        poses = rows
+    elif len(rows) == count == len(frame_numbers):
+        poses = dict(zip(frame_numbers, rows.values(), strict=True))
+        if frame_numbers[-1] - frame_numbers[0] >= count:
+            log.warn(f"kitti: {path} has a line for each of the {count} frames: line k is taken for the k-th of them, gaps or not")
+    else:
+        expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
+        raise InputError("pose file does not cover the frames", where=str(path), got=f"{count} lines",
+            expected=expected)  # fmt: skip
+    sensor = "velo" if widths == {13} else "cam0"
+    return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
+
+
+def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
+    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``; empty files and lines are missing packets.
+
+    Args:
+        path: a folder with one file per frame (raw data), or one file with a line per frame (tracking).
+    """
+    if path.is_dir():
+        found = {int(file.stem): file for file in path.iterdir() if file.stem.isdigit() and file.suffix == ".txt"}
+        wheres = {n: str(file) for n, file in sorted(found.items()) if frames[0] <= n <= frames[-1]}
+        texts = {n: list(read_lines(found[n]).values()) for n in wheres}
+        lines = {n: text[0] for n, text in texts.items() if text}
+    else:
+        lines = {n: line for n, line in read_lines(path).items() if frames[0] <= n <= frames[-1]}
+        wheres = {n: f"{path}: line {n + 1}" for n in lines}
+    return {n: line_numbers(line, (_OXTS_VALUES,), wheres[n], "GPS/IMU packet") for n, line in lines.items()}
+
+
+def poses_from_packets(packets: NDArray[np.float64], where: str) -> Matrix:
+    """World-from-IMU poses f64[n, 4, 4] of GPS/IMU packets f64[n, 30].
+
+    Latitude and longitude are projected as Mercator, scaled at the first packet's latitude, so that distances near the
+    start are true; roll, pitch and yaw turn about x, y and z in that order. World: the first position is the origin, x
+    along the first heading, z against gravity.
+    """
+    if (np.abs(packets[:, 0]) > 89).any() or (np.abs(packets[:, 1]) > 180).any():
+        raise InputError("latitude or longitude is out of range", where=where, expected="degrees")
+    latitude, longitude = np.deg2rad(packets[:, 0]), np.deg2rad(packets[:, 1])
+    scale = np.cos(latitude[0])
+    east = scale * EARTH_RADIUS_M * longitude
+    north = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
+    positions = np.stack([east, north, packets[:, 2]], 1)
+    poses = np.stack(
+        [
+            from_rotation_translation(_roll_pitch_yaw(*packet[3:6]), position - positions[0])
+            for packet, position in zip(packets, positions, strict=True)
+        ]
+    )
+    return yaw_matrix(-yaw_of(poses[0])) @ poses
+
+
+def _roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    return yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
+
+
+def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, float]:
+    """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
+
+    Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for that, but has just one
+    line per recorded file, counts those instead.
+
+    Args:
+        numbers: of the recorded files, increasing.
+        last: the highest number that is needed.
+
+    Raises:
+        InputError: no times, or too few.
+    """
+    lines = read_lines(path)
+    stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}
+    count = len(store.read_text(path).splitlines())
+    if count > last:
+        return stamps
+    if len(stamps) == max(stamps, default=-1) + 1 == len(numbers) > 0:
+        log.warn(f"kitti: {path} has a line for each of the {len(numbers)} files: line k is taken for the k-th of them, gaps or not")
+        return dict(zip(numbers, stamps.values(), strict=True))
+    raise InputError("timestamps do not cover the frames", where=str(path), got=f"{count} lines, {len(numbers)} files",
+        expected=f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file",
+        remedy="is the file cut off?")  # fmt: skip
+
+
+def _stamp(line: str, where: str) -> float:
+    match = re.fullmatch(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,12})?", line.strip())
+    if match is None:
+        return float(line_numbers(line, (1,), where, "timestamp")[0])
+    try:
+        second = datetime.datetime.strptime(match[1], "%Y-%m-%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+    except ValueError as error:
+        raise InputError("timestamp is no date", where=where, got=line.strip()) from error
+    return second.timestamp() + float(match[2] or 0)
+
+
+# boxes ----------------------------------------------------------------------------------------------------------------
+#
+# KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame number.
+
+
+MAX_TRACKLET_BYTES = 256 * 1024 * 1024
+LABELS = frozenset(
+    ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
+)
+"""Classes of the benchmarks, in lower case."""
+_TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
+_TRACKLET_POSE = frozenset({
+    "tx", "ty", "tz", "rx", "ry", "rz", "state", "occlusion", "occlusion_kf", "truncation", "amt_occlusion", "amt_occlusion_kf",
+    "amt_border_l", "amt_border_r", "amt_border_kf",
+})  # fmt: skip
+"""Fields of the data set's tracklets, read or not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiBox:
+    """One annotated box.
+
+    Args:
+        frame: frame number.
+        track: track number; object labels count lines.
+        label: lower-case class, e.g. ``car``.
+        size_m: length, width, height.
+        sensor_from_box: box frame (x forward, y left, z up, origin in the centre) to the velodyne, f64[4, 4].
+        box2d_px: annotated rectangle (left, top, right, bottom) in KITTI's pixels, or None.
+    """
+
+    frame: int
+    track: int
+    label: str
+    size_m: tuple[float, float, float]
+    sensor_from_box: Matrix
+    box2d_px: tuple[float, float, float, float] | None = None
+
+
+def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y: float) -> Matrix:
+    """Box frame to rectified camera 0 from KITTI's bottom centre (y down) and turn about the camera's y axis, f64[4, 4]."""
+    c, s = np.cos(rotation_y), np.sin(rotation_y)
+    forward, left, up = (c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)
+    centre = np.asarray(bottom_centre_m, np.float64) - [0, height_m / 2, 0]
+    return from_rotation_translation(np.array([forward, left, up]).T, centre)
+
+
+def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
+    """Boxes of a tracking label file (17 columns and optionally a score), or of an object label file.
+
+    Args:
+        path: label text. ``DontCare`` regions are left out.
+        rect0_from_velo: boxes are given in rectified camera 0 and returned in the velodyne frame, f64[4, 4].
+        frame: frame number for an object label file (15 columns and optionally a score); None for a tracking file.
+
+    Raises:
+        InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
+    """
+    velo_from_rect0 = invert(rect0_from_velo)
+    boxes = []
+    skip = 2 if frame is None else 0
+    for index, line in read_lines(path).items():
+        columns, where = line.split(), f"{path}: line {index + 1}"
+        if len(columns) - skip not in (15, 16):
+            raise InputError("label line has the wrong number of columns", where=where, got=str(len(columns)),
+                expected=f"{15 + skip} (or {16 + skip} with a score)",
+                remedy="is this a tracking or an object label file?")  # fmt: skip
+        if columns[skip] == "DontCare":
+            continue
+        try:
+            number, track = (frame, index) if frame is not None else (int(columns[0]), int(columns[1]))
+            values = [float(text) for text in columns[skip + 1 :]]
+        except ValueError as error:
+            raise InputError("label value is not a number", where=where, got=str(error)) from error
+        if not np.isfinite(values).all():
+            raise InputError("label value is not finite", where=where, got=line.strip()[:100])
+        left, top, right, bottom, height, width, length, x, y, z, turn = values[3:14]
+        size_m = box_size(length, width, height, where)
+        pose = velo_from_rect0 @ rect0_from_box((x, y, z), height, turn)
+        boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose, (left, top, right, bottom)))
+    return boxes
+
+
+def read_tracklets(path: Path) -> list[KittiBox]:
+    """Boxes of a raw-data ``tracklet_labels.xml``: velodyne frame, bottom centre, turn about z."""
+    content = store.read_bytes(path)
+    if len(content) > MAX_TRACKLET_BYTES:
+        raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
+    if b"<!ENTITY" in content:
+        raise InputError("tracklet file declares XML entities, which no KITTI file does", where=str(path),
+            remedy="use the file from the data set")  # fmt: skip
+    try:
+        root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
+    except ElementTree.ParseError as error:
+        raise InputError("tracklet file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
+    boxes = []
+    for track, item in enumerate(root.findall("./tracklets/item")):
+        where = f"{path}: tracklet {track}"
+        note_unknown(path.name, [field.tag for field in item], _TRACKLET)
+        length, width, height = (_xml_number(item, key, where) for key in ("l", "w", "h"))
+        size_m = box_size(length, width, height, where)
+        first = int(_xml_number(item, "first_frame", where))
+        label = (item.findtext("objectType") or "").strip().lower()
+        for step, pose in enumerate(item.findall("./poses/item")):
+            here = f"{where} pose {step}"
+            note_unknown(path.name, [field.tag for field in pose], _TRACKLET_POSE)
+            tx, ty, tz, rz = (_xml_number(pose, key, here) for key in ("tx", "ty", "tz", "rz"))
+            boxes.append(KittiBox(first + step, track, label, size_m, yaw_matrix(rz, (tx, ty, tz + height / 2))))
+    return boxes
+
+
+def _xml_number(element: ElementTree.Element, key: str, where: str) -> float:
+    text = element.findtext(key)
+    try:
+        value = float(text) if text is not None else float("nan")
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputError(f"tracklet field {key!r} is missing or not a number", where=where, got=repr(text))
+    return value
+
+
+def build_tracks(
+    boxes: Sequence[KittiBox],
+    world_from_velo: Mapping[int, Matrix],
+    times_s: Mapping[int, float],
+    where: str,
+    velo_at: Callable[[float], Matrix] | None = None,
+) -> tuple[list[Track], list[str]]:
+    """Tracks in the world from boxes per frame, in the order of their numbers.
+
+    Boxes of frames that are not imported are left out. A track that is not seen for longer than ``box_tracks.MAX_GAP_S``
+    is split into ``7``, ``7.1``, ... The size is the median over the track.
+
+    Args:
+        boxes: in any order.
+        world_from_velo: pose of the velodyne f64[4, 4] by frame number.
+        times_s: time of the scan by frame number, seconds.
+        where: the file the boxes come from, for messages.
+        velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box then
+            belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's velocity.
+
+    Returns:
+        The tracks, and notes for people (splits, boxes left out).
+    """
+    collected = BoxTracks(where, {label: label for label in LABELS})
+    delays_s: dict[tuple[str, float], float] = {}
+    outside = 0
+    for box in boxes:
+        if box.frame not in world_from_velo:
+            outside += 1
+            continue
+        name, time_s, pose = str(box.track), times_s[box.frame], world_from_velo[box.frame]
+        if velo_at is not None:
+            x, y = box.sensor_from_box[:2, 3]
+            delay_s = delays_s[name, time_s] = float(azimuth_delay_s(float(np.arctan2(y, x))))
+            pose = velo_at(time_s + delay_s)
+        record = f"{where}: track {name}, frame {box.frame}"
+        collected.add(name, collected.label_of(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
+    found, notes = collected.tracks()
+    if velo_at is not None:
+        found = [_at_scan_times(track, delays_s) for track in found]
+    if outside:
+        notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")
+    return sorted(found, key=lambda track: [int(part) for part in track.id.split(".")]), notes
+
+
+def _at_scan_times(track: Track, delays_s: Mapping[tuple[str, float], float]) -> Track:
+    """The track moved from the moments at which its boxes were measured to the times of the scans."""
+    late_s = np.array([delays_s[track.id.split(".")[0], time_s] for time_s in track.times_s])
+    if len(late_s) == 1:
+        return track
+    poses = track.world_from_object.copy()
+    poses[:, :3, 3] -= np.gradient(poses[:, :3, 3], track.times_s + late_s, axis=0) * late_s[:, None]
+    return replace(track, world_from_object=poses)

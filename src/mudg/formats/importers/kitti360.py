@@ -1,0 +1,782 @@
+"""KITTI-360 importer: one drive of the data set's folder.
+
+========================== =========================================================================================
+``calibration/``           cameras, velodyne, SICK (``calib``)
+``data_2d_raw/<drive>/``   ``image_00|01/data_rect`` (rectified stereo), ``image_02|03/data_rgb`` (fisheyes)
+``data_3d_raw/<drive>/``   ``velodyne_points/data``, ``sick_points/data``, each with ``timestamps.txt``
+``data_poses/<drive>/``    ``poses.txt`` (vehicle) or ``cam0_to_world.txt`` (rectified camera 0), for part of the frames
+``data_3d_bboxes/``        ``train_full/<drive>.xml``, else ``train/<drive>.xml`` (``boxes``)
+``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
+========================== =========================================================================================
+
+Frames. World: z up, origin and x axis at the vehicle of the first imported frame (the data set's own world lies kilometres
+away). The vehicle is the GPS/IMU. ``image_00`` is called ``front``.
+
+Time. All sensors of a frame share one moment, as the data set's own tools have it: the velodyne's time stamp. Poses are missing
+where the vehicle hardly moves; they are interpolated there. Frames before the first and after the last pose are left out.
+
+Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1 s and
+looks forward at the frame's moment (as the data set's tools have it). Lines of the SICK scanners, about four a frame, become
+one sweep per frame.
+
+Fisheye cameras are taken when they are asked for (``--cameras side_left side_right``): rectified to a pinhole camera that
+looks along the lens' axis and is 90 degrees wide and high, with the lens' own resolution in its centre.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from mudg.base import log, store
+from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, invert, transform_points
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
+from mudg.formats.importers import layout
+from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers.clouds import read_float_rows
+from mudg.formats.importers.common import (
+    ImportOptions,
+    deskew,
+    mended_path,
+    origin_note,
+    pose_near,
+    rigid_pose,
+    rigid_rotation,
+    seconds,
+    world_from_first,
+)
+from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
+from mudg.formats.importers.kitti import files as kitti_poses
+from mudg.formats.importers.kitti.files import (
+    SENSOR,
+    line_numbers,
+    pinhole_camera,
+    read_number_table,
+    read_scan,
+    table_entry,
+)
+from mudg.formats.importers.layout import LogFiles
+from mudg.formats.unknown_fields import note_unknown
+from mudg.scene.motion import GAP_M
+
+# boxes ----------------------------------------------------------------------------------------------------------------
+#
+# KITTI-360 bounding primitives: ``data_3d_bboxes/*/<drive>.xml``, OpenCV-style matrices in XML, boxes in the world.
+#
+# An object's ``transform`` maps its ``vertices`` (a unit cube for the classes read here) to the world and holds the size as scale.
+# Static objects have ``timestamp`` -1 and a window of frames; objects that move have one entry per frame.
+#
+# The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF`` are kept.
+
+
+LABEL_OF_ID: Final = {
+    13: "car", 14: "truck", 34: "bus", 16: "caravan", 15: "trailer", 33: "train", 17: "motorcycle", 18: "bicycle",
+    19: "person", 20: "rider", 36: "unknown vehicle",
+}  # fmt: skip
+"""The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table (kittiId)."""
+LABEL_OF: Final = {
+    "car": "car", "truck": "truck", "bus": "bus", "caravan": "caravan", "trailer": "trailer", "train": "train",
+    "motorcycle": "motorcycle", "bicycle": "bicycle", "person": "pedestrian", "pedestrian": "pedestrian",
+    "rider": "cyclist", "unknown vehicle": "vehicle",
+}  # fmt: skip
+"""Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
+_OFFICIAL: Final = frozenset({
+    "index", "label", "category", "semanticId", "semanticId_orig", "instanceId", "timestamp", "start_frame", "end_frame", "dynamic",
+    "dynamicSeq", "dynamicIdx", "dynamicIndex", "level_min", "level_max", "color", "transform", "vertices", "faces",
+})  # fmt: skip
+"""Fields of the data set's objects, read or not."""
+VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
+MAX_FILE_BYTES: Final = 8 * 1024**3
+_CHUNK: Final = 1 << 20
+_MAX_VALUES: Final = 100_000
+_MAX_SHEAR: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kitti360Box:
+    """One box in the data set's world.
+
+    Args:
+        object_id: the same for all boxes of an object.
+        label: class as in ``LABEL_OF``.
+        frame: frame number of a box that moves; -1 for an object that stands.
+        window: first and last frame of the part of the drive the box was drawn in.
+        size_m: length, width, height.
+        world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
+    """
+
+    object_id: str
+    label: str
+    frame: int
+    window: tuple[int, int]
+    size_m: tuple[float, float, float]
+    world_from_box: Matrix
+
+
+def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
+    """Boxes of the classes in ``LABEL_OF``, one by one.
+
+    Args:
+        path: the XML file.
+        left_out: filled with what is not read (``that are not cuboids``) and how often.
+
+    Raises:
+        InputError: missing, cut off, malformed, or it declares XML entities.
+    """
+    for number, item in enumerate(_objects(path)):
+        where = f"{path}: object {number} ({item.tag})"
+        if item.find("transform") is None:
+            continue
+        note_unknown(path.name, [field.tag for field in item], _OFFICIAL)
+        label = _label(item, where)
+        if label not in LABEL_OF:
+            left_out["of classes that do not move"] += 1
+            continue
+        frame = _integer(item, "timestamp", where)
+        shape = _shape(_matrix(item, "transform", where), _matrix(item, "vertices", where), label, where)
+        if shape is None:
+            left_out["that are not cuboids"] += 1
+            continue
+        size_m, pose = shape
+        if item.find("start_frame") is not None:
+            window = (_integer(item, "start_frame", where), _integer(item, "end_frame", where))
+        else:
+            window = (0, 2**31) if frame < 0 else (frame, frame)
+        yield Kitti360Box(_object_id(item, frame, where), label, frame, window, size_m, pose)
+
+
+def _objects(path: Path) -> Iterator[ElementTree.Element]:
+    """The children of the top element, each freed after use."""
+    parser = ElementTree.XMLPullParser(("start", "end"))
+    depth = 0
+    top: ElementTree.Element | None = None
+    tail = b""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError("box file is too large", where=str(path), expected=f"<= {MAX_FILE_BYTES} bytes")
+        with store.open_file(path) as handle:
+            while chunk := handle.read(_CHUNK):
+                _refuse_entities(tail + chunk, str(path), first=not tail)
+                tail = chunk[-16:]
+                parser.feed(chunk)
+                events: Iterator[Any] = parser.read_events()
+                for event, element in events:
+                    if event == "start":
+                        depth += 1
+                        top = element if depth == 1 else top
+                    else:
+                        depth -= 1
+                        if depth == 1:
+                            yield element
+                            element.clear()
+                            if top is not None:
+                                top.clear()
+        parser.close()
+    except FileNotFoundError as error:
+        raise InputError("box file does not exist", where=str(path)) from error
+    except OSError as error:
+        raise InputError("box file cannot be read", where=str(path), got=str(error)) from error
+    except ElementTree.ParseError as error:
+        raise InputError("box file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
+
+
+def _refuse_entities(content: bytes, where: str, first: bool) -> None:
+    """Entities can blow a small file up; other encodings could hide them from this look."""
+    head = content[:200].lower()
+    other = first and b"encoding" in head and not any(name in head for name in (b"utf-8", b"ascii"))
+    if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
+        raise InputError(
+            "box file declares a document type, entities or another encoding, which the data set's files do not",
+            where=where, remedy="use the file from the data set")  # fmt: skip
+
+
+def _label(item: ElementTree.Element, where: str) -> str:
+    if item.find("semanticId") is not None:
+        return LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
+    text = (item.findtext("label") or "").strip()
+    return "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in text).strip()
+
+
+def _object_id(item: ElementTree.Element, frame: int, where: str) -> str:
+    if item.find("instanceId") is not None and item.find("semanticId") is not None:
+        return f"{_integer(item, 'semanticId', where)}-{_integer(item, 'instanceId', where)}"
+    if frame >= 0 and item.find("dynamicSeq") is not None:
+        return f"d-{_integer(item, 'dynamicSeq', where)}"
+    return f"i-{_integer(item, 'index', where)}"
+
+
+def _integer(item: ElementTree.Element, key: str, where: str) -> int:
+    text = item.findtext(key)
+    try:
+        return int(text) if text is not None else int("")
+    except ValueError as error:
+        raise InputError(f"field {key!r} is missing or no whole number", where=where, got=repr(text)[:40]) from error
+
+
+def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
+    node = item.find(key)
+    if node is None:
+        raise InputError(f"box has no {key}", where=where)
+    rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
+    texts = (node.findtext("data") or "").split()
+    if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
+        raise InputError("matrix does not have the size it declares", where=f"{where}.{key}",
+            expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")  # fmt: skip
+    try:
+        values = np.array([float(text) for text in texts])
+    except ValueError as error:
+        raise InputError("matrix holds no number", where=f"{where}.{key}", got=str(error)) from error
+    if not np.isfinite(values).all():
+        raise InputError("matrix holds a value that is not finite", where=f"{where}.{key}")
+    return values.reshape(rows, columns)
+
+
+def _shape(
+    transform: Matrix, vertices: Matrix, label: str, where: str
+) -> tuple[tuple[float, float, float], Matrix] | None:
+    """Size and pose of the box, or None if it is sheared.
+
+    The axis that stands upright becomes z. Of the others, the first becomes x, for vehicles the longer one: which of them
+    the annotation tool called x does not matter for the box.
+    """
+    if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise InputError("box is not a 4x4 transform of 3-D vertices", where=where,
+            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}")  # fmt: skip
+    low, high = vertices.min(0), vertices.max(0)
+    scale = np.linalg.norm(transform[:3, :3], axis=0)
+    sizes = scale * (high - low)
+    if (sizes <= 0).any():
+        raise InputError("box size is not positive", where=where, got=str(sizes.tolist()))
+    axes = transform[:3, :3] / scale
+    if max(abs(axes[:, a] @ axes[:, b]) for a, b in ((0, 1), (0, 2), (1, 2))) > _MAX_SHEAR:
+        return None
+    up = int(np.abs(axes[2]).argmax())
+    first, second = (index for index in range(3) if index != up)
+    if label in VEHICLES and sizes[second] > sizes[first]:
+        first, second = second, first
+    z = axes[:, up] * (1 if axes[2, up] > 0 else -1)
+    x = axes[:, first] - z * (axes[:, first] @ z)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z], 1)
+    centre = transform[:3, :3] @ ((low + high) / 2) + transform[:3, 3]
+    return (float(sizes[first]), float(sizes[second]), float(sizes[up])), from_rotation_translation(rotation, centre)
+
+
+# calib ----------------------------------------------------------------------------------------------------------------
+#
+# KITTI-360 calibration: rectified perspective cameras, fisheye cameras (model of Mei), LiDARs, all on the vehicle.
+#
+# The data set's vehicle frame is that of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point with y to
+# the left and z up.
+
+
+IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+FISHEYES: Final = ("image_02", "image_03")
+FISHEYE_VIEW_DEG: Final = 90.0
+_FISHEYE_VALUES: Final = (
+    "image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0",
+)  # fmt: skip
+_FISHEYE: Final = frozenset({
+    *_FISHEYE_VALUES, "model_type", "camera_name", "mirror_parameters", "distortion_parameters", "projection_parameters",
+})  # fmt: skip
+"""Entries of the data set's fisheye calibrations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kitti360Calibration:
+    """What is fixed on the vehicle.
+
+    Args:
+        folder: where it was read.
+        ego_from_camera: ``image_00`` .. ``image_03`` -> f64[4, 4]; perspective cameras as rectified.
+        ego_from_velo: f64[4, 4].
+        velo_from_sick: f64[4, 4], or None if the file is not there.
+        imu_from_rect0: the data set's vehicle frame from rectified camera 0, f64[4, 4].
+    """
+
+    folder: Path
+    ego_from_camera: dict[str, Matrix]
+    ego_from_velo: Matrix
+    velo_from_sick: Matrix | None
+    imu_from_rect0: Matrix
+
+    def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
+        """How images of ``camera`` (``image_02``), of ``size`` (width, height), become images of the scene's ``name``."""
+        if camera in FISHEYES:
+            return self._fit_fisheye(camera, name, size, options)
+        path = self.folder / "perspective.txt"
+        table = read_number_table(path)
+        projection = table_entry(table, (f"P_rect_{camera[-2:]}",), (3, 4), path)
+        declared = table_entry(table, (f"S_rect_{camera[-2:]}",), (2,), path)
+        _check_size(size, (int(declared[0]), int(declared[1])), f"{path}: S_rect_{camera[-2:]}")
+        return fit_images(pinhole_camera(projection, name, size, f"{path}: P_rect_{camera[-2:]}"), options)
+
+    def _fit_fisheye(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
+        path = self.folder / f"{camera}.yaml"
+        values = _read_fisheye(path)
+        _check_size(size, (int(values["image_width"]), int(values["image_height"])), f"{path}: image_width")
+        xi, bend = values["xi"], tuple(values[key] for key in ("k1", "k2", "p1", "p2"))
+        distort = brown_conrady(*bend)
+
+        def lens(xy: Matrix) -> Matrix:
+            """Unit sphere, seen from ``xi`` behind its centre, then radial and tangential distortion."""
+            length = np.sqrt(1 + (xy**2).sum(1))
+            return distort(xy / (1 + xi * length)[:, None])
+
+        recorded = Camera(
+            name, *size, values["gamma1"], values["gamma2"], values["u0"] + 0.5, values["v0"] + 0.5, (xi, *bend)
+        )  # fmt: skip
+        # the focal length at the lens' centre, so that nothing is lost or made up there
+        focal = values["gamma1"] / (1 + xi)
+        side = max(16, round(2 * focal * np.tan(np.deg2rad(FISHEYE_VIEW_DEG / 2))))
+        target = replace(recorded, width=side, height=side, fx=focal, fy=focal, cx=side / 2, cy=side / 2)
+        return fit_images(recorded, options, lens, target)
+
+
+def read_calibration(folder: Path) -> Kitti360Calibration:
+    """Read ``calibration/``.
+
+    Raises:
+        InputError: a file or entry is missing, or a matrix is not a rigid motion.
+    """
+    path = folder / "calib_cam_to_pose.txt"
+    table = read_number_table(path)
+    imu_from_camera = {
+        name: rigid_pose(table_entry(table, (name,), (3, 4), path), f"{path}: {name}")
+        for name in ("image_00", "image_01", "image_02", "image_03")
+        if name == "image_00" or name in table
+    }
+    imu_from_velo = imu_from_camera["image_00"] @ invert(_rigid_file(folder / "calib_cam_to_velo.txt"))
+    perspective = folder / "perspective.txt"
+    numbers = read_number_table(perspective)
+    for name in ("image_00", "image_01"):
+        if name in imu_from_camera:
+            where = f"{perspective}: R_rect_{name[-2:]}"
+            rectify = rigid_rotation(table_entry(numbers, (f"R_rect_{name[-2:]}",), (3, 3), perspective), where)
+            imu_from_camera[name] = imu_from_camera[name] @ from_rotation_translation(rectify.T, np.zeros(3))
+    sick = folder / "calib_sick_to_velo.txt"
+    ego_from_imu = invert(IMU_FROM_EGO)
+    return Kitti360Calibration(
+        folder,
+        {name: ego_from_imu @ pose for name, pose in imu_from_camera.items()},
+        ego_from_imu @ imu_from_velo,
+        _rigid_file(sick) if sick.is_file() else None,
+        imu_from_camera["image_00"],
+    )
+
+
+def _rigid_file(path: Path) -> Matrix:
+    numbers = line_numbers(store.read_text(path).replace("\n", " "), (12,), str(path), "calibration")
+    return rigid_pose(numbers.reshape(3, 4), str(path))
+
+
+def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
+    if size != declared:
+        raise InputError("images do not have the size that the calibration is for", where=where,
+            expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
+            remedy="use the images as the data set ships them")  # fmt: skip
+
+
+def _read_fisheye(path: Path) -> dict[str, float]:
+    """The numbers of an OpenCV-style YAML file by their keys; nesting does not matter, keys are distinct."""
+    text = store.read_bytes(path).decode("utf-8", "replace")
+    model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
+    if model is None or model[1] != "MEI":
+        raise InputError("fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
+            got=model[1] if model else "no model_type")  # fmt: skip
+    note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
+    found: dict[str, float] = {}
+    for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
+        try:
+            found[key] = float(value)
+        except ValueError as error:
+            raise InputError("fisheye calibration holds no number", where=f"{path}: {key}", got=value[:40]) from error
+    missing = [key for key in _FISHEYE_VALUES if key not in found]
+    if missing:
+        raise InputError("fisheye calibration is incomplete", where=str(path), expected=", ".join(_FISHEYE_VALUES),
+            got=f"no {', '.join(missing)}", remedy="is the file cut off?")  # fmt: skip
+    if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
+        raise InputError("fisheye calibration makes no sense", where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0",
+                         got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}")  # fmt: skip
+    return found
+
+
+# importer -------------------------------------------------------------------------------------------------------------
+
+
+Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
+CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}
+USUAL: Final = ("image_00", "image_01")
+SICK: Final = "sick"
+FRAME_PERIOD_S: Final = 0.1
+_SICK_REACH_S: Final = 0.055
+_TRAIN_IDS: Final = {
+    7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15,
+    31: 16, 32: 17, 33: 18, 34: 2, 35: 4, 37: 5,
+}  # fmt: skip
+"""The data set's class ids -> Cityscapes train ids (garage = building, gate = fence, small pole = pole); others unlabelled."""
+_LAST_ID: Final = 44
+
+
+@dataclass(frozen=True, slots=True)
+class _Folders:
+    """The data set's folder and the drive."""
+
+    root: Path
+    drive: str
+
+    def images(self, camera: str) -> Path:
+        return self.root / "data_2d_raw" / self.drive / camera / ("data_rect" if camera in USUAL else "data_rgb")
+
+    def raw(self, sensor: str) -> Path:
+        return self.root / "data_3d_raw" / self.drive / sensor
+
+    def semantics(self, camera: str, kind: str, number: int) -> Path:
+        return self.root / "data_2d_semantics" / "train" / self.drive / camera / kind / f"{number:010d}.png"
+
+    def boxes(self) -> tuple[Path, Path]:
+        """Where boxes may be, the better first."""
+        folder = self.root / "data_3d_bboxes"
+        return folder / "train_full" / f"{self.drive}.xml", folder / "train" / f"{self.drive}.xml"
+
+
+def looks_like_kitti360(source: Path) -> bool:
+    """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in ``data_2d_raw``."""
+    if not source.is_dir():
+        return False
+    root = source.absolute().parent.parent if source.absolute().parent.name == "data_2d_raw" else source
+    return (root / "data_2d_raw").is_dir() and (root / "calibration" / "calib_cam_to_pose.txt").is_file()
+
+
+def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood.
+
+    Args:
+        source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
+        out: destination.
+        options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the stereo
+            pair; all others are used too.
+
+    Raises:
+        UsageError: there are several drives and none was chosen, or an option does not apply.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    folders = _find(source, options)
+    calibration = read_calibration(folders.root / "calibration")
+    images = {name: layout.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
+    chosen = layout.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
+    scans = layout.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
+    notes: list[str] = []
+    clock = _clock(folders, streams, notes)
+    poses = _find_poses(folders, options)
+    notes.append(f"poses from {poses.name}")
+    ego = mended_path(_read_motion(poses, calibration, clock), options, notes)
+    placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
+    frames = layout.complete_frames(placed, options, str(folders.root), "kitti360")
+    notes += _without_pose(streams.values(), placed.values(), options)
+    start_s = float(clock[frames[0]])
+    first = pose_near(ego, clock[frames[0]])
+    world_from_source = world_from_first(first)
+    notes.append(origin_note(first))
+    scene_s = seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
+    ego = EgoPath(ego.times_s - start_s, world_from_source @ ego.world_from_ego)
+    fits = {CAMERAS[n]: calibration.fit(n, CAMERAS[n], image_size(images[n][frames[0]]), options) for n in chosen}
+    untwist = bool(scans) and options.untwist != "no"
+    if not scans:
+        log.warn("kitti360: no scans found: the scene has images only, and there is nothing to fuse")
+    elif untwist:
+        notes.append("scans untwisted: clockwise turn of 0.1 s, forward at the frame's moment")
+    notes += image_notes(fits)
+    notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
+    sick = _SickLines.find(folders, calibration, ego, start_s, notes)
+    tracks = _read_tracks(folders, options, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
+
+    def convert(index: int) -> Iterable[SceneImage | SceneSweep]:
+        number, time_s = frames[index], float(scene_s[index])
+        world_from_ego = pose_near(ego, time_s)
+        for name in chosen:
+            world_from_cam = world_from_ego @ calibration.ego_from_camera[name]
+            path, labels = images[name][number], _labels(folders, name, number, fits[CAMERAS[name]])
+            yield SceneImage(CAMERAS[name], index, time_s, world_from_cam, path, str(path), labels)
+        if number in scans:
+            points = read_scan(scans[number])
+            if untwist:
+                points = _untwisted(points, ego, calibration, time_s)
+            world_from_velo = world_from_ego @ calibration.ego_from_velo
+            yield SceneSweep(SENSOR, index, time_s, world_from_velo, points, str(scans[number]))
+        if sick is not None:
+            yield from sick.sweeps(index, time_s)
+
+    origin = Source("kitti360", LICENCE, None, tuple(notes))
+    path = EgoPath(scene_s, np.stack([pose_near(ego, float(time_s)) for time_s in scene_s]))
+    content = SceneContent(
+        folders.drive, origin, fits, range(len(frames)), convert, lambda index: f"frame {frames[index]}", path,
+        tracks=lambda: (tracks, ()),
+    )  # fmt: skip
+    return write_scene(content, out, options)
+
+
+def _find(source: Path, options: ImportOptions) -> _Folders:
+    if not source.is_dir():
+        raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
+    if source.absolute().parent.name == "data_2d_raw":
+        return _Folders(source.absolute().parent.parent, source.absolute().name)
+    raw = source / "data_2d_raw"
+    if not raw.is_dir():
+        raise InputError("no KITTI-360 recording found", where=str(source), got=layout.folder_contents(source),
+            expected="data_2d_raw, data_poses and calibration in it")  # fmt: skip
+    drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
+    wanted = options.sequence
+    matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
+    return _Folders(source, layout.the_only(matching, drives, options, raw, "drive"))
+
+
+def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
+    """The calibration and the parts of the chosen drive."""
+    folders = _find(source, options)
+    root, drive = folders.root, folders.drive
+    parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
+    parts += [root / "data_2d_semantics" / "train" / drive, *folders.boxes()]
+    return LogFiles(tuple(part for part in parts if part.exists()))
+
+
+def _without_pose(
+    streams: Iterable[Iterable[int]], placed: Iterable[Iterable[int]], options: ImportOptions
+) -> list[str]:
+    """A note about the frames within ``options.frames`` that some stream has and none could place."""
+    first, end = options.frames or (0, 2**63)
+    lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
+    return [f"frames without a pose or time stamp were left out: {layout.number_ranges(sorted(lost))}"] if lost else []
+
+
+# --- time and motion ------------------------------------------------------------------------------------------------
+
+
+def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: list[str]) -> NDArray[np.float64]:
+    """Seconds by frame number, NaN where there is no stamp: the velodyne's, else camera 0's, else 10 Hz."""
+    last = max(max(found) for found in streams.values())
+    for path, files in (
+        (folders.raw("velodyne_points") / "timestamps.txt", streams.get(SENSOR, {})),
+        (folders.root / "data_2d_raw" / folders.drive / "image_00" / "timestamps.txt", streams.get("image_00", {})),
+    ):
+        if path.is_file():
+            return _stamps(path, files, last)
+    notes.append("no timestamps in the source: 10 Hz assumed")
+    return np.arange(last + 1, dtype=np.float64) * FRAME_PERIOD_S
+
+
+def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
+    """Seconds by number, f64[last + 1] or more; NaN where there is no stamp. See ``read_timestamps``."""
+    stamps = kitti_poses.read_timestamps(path, list(files), last)
+    times = np.full(max(last, *stamps, 0) + 1, np.nan)
+    times[list(stamps)] = list(stamps.values())
+    return times
+
+
+def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
+    here = folders.root / "data_poses" / folders.drive
+    path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
+    if path is None:
+        raise InputError("no vehicle poses found", where=str(options.poses or here),
+            expected="poses.txt or cam0_to_world.txt", remedy="download the data set's vehicle poses")  # fmt: skip
+    return path
+
+
+def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np.float64]) -> EgoPath:
+    """The vehicle at the frames that have a pose, in the data set's world and clock."""
+    numbers, poses, before = [], [], -1
+    for index, line in kitti_poses.read_lines(path).items():
+        where = f"{path}: line {index + 1}"
+        row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
+        number = int(row[0])
+        if number != row[0] or number <= before:
+            raise InputError("first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
+                remedy="is the file of another kind?")  # fmt: skip
+        before = number
+        if number < len(clock) and np.isfinite(clock[number]):
+            pose = rigid_pose(row[1:].reshape(-1, 4), where)
+            numbers.append(number)
+            poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
+    if not poses:
+        raise InputError("no pose belongs to a frame", where=str(path),
+            expected=f"frame numbers up to {len(clock) - 1}")  # fmt: skip
+    times = clock[numbers]
+    if (np.diff(times) <= 0).any():
+        frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
+        raise InputError("timestamps do not increase", where=f"{path}: frame {frame}")
+    return EgoPath(times, np.stack(poses) @ IMU_FROM_EGO)
+
+
+def _has_pose(ego: EgoPath, time_s: float) -> bool:
+    """Whether there is a pose at a time, or the vehicle moved less than ``GAP_M`` between the poses around it. NaN: no."""
+    if not np.isfinite(time_s):
+        return False
+    after = int(np.searchsorted(ego.times_s, time_s))
+    if after < len(ego.times_s) and ego.times_s[after] - time_s < 1e-9:
+        return True
+    if after in (0, len(ego.times_s)):
+        return False
+    moved = ego.world_from_ego[after, :3, 3] - ego.world_from_ego[after - 1, :3, 3]
+    return bool(np.linalg.norm(moved) < GAP_M)
+
+
+def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
+    """A scan as seen at its frame's moment: a point at azimuth a was measured a / 2 pi turns before it."""
+    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+    dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
+    xyz = deskew(points.xyz, dt_s, lambda t: pose_near(ego, t) @ calibration.ego_from_velo, time_s)
+    return replace(points, xyz=xyz, dt_s=dt_s)
+
+
+# --- SICK lines -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SickLines:
+    """Line scans beside the frames: files, their times in the scene's clock, and where the scanner sits."""
+
+    files: Mapping[int, Path]
+    times_s: NDArray[np.float64]
+    ego_from_sick: Matrix
+    ego: EgoPath
+
+    @classmethod
+    def find(
+        cls, folders: _Folders, calibration: Kitti360Calibration, ego: EgoPath, start_s: float, notes: list[str]
+    ) -> _SickLines | None:
+        files = layout.numbered_files(folders.raw("sick_points") / "data", (".bin",))
+        stamps = folders.raw("sick_points") / "timestamps.txt"
+        if not files:
+            return None
+        if calibration.velo_from_sick is None or not stamps.is_file():
+            notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
+            return None
+        times = _stamps(stamps, files, max(files)) - start_s
+        return cls(files, times, calibration.ego_from_velo @ calibration.velo_from_sick, ego)
+
+    def sweeps(self, index: int, time_s: float) -> Iterable[SceneSweep]:
+        """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
+        pose = pose_near(self.ego, time_s) @ self.ego_from_sick
+        parts, delays, no_returns = [], [], 0
+        for number in np.flatnonzero(np.abs(self.times_s - time_s) < _SICK_REACH_S):
+            late = float(self.times_s[number] - time_s)
+            nearer = late >= FRAME_PERIOD_S / 2 or late < -FRAME_PERIOD_S / 2
+            if int(number) not in self.files or nearer:
+                continue
+            line, without = _read_line(self.files[int(number)])
+            no_returns += without
+            parts.append(transform_points(invert(pose) @ pose_near(self.ego, time_s + late) @ self.ego_from_sick, line))
+            delays.append(np.full(len(line), late, np.float32))
+        xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
+        if len(xyz):
+            points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays), no_returns=no_returns)
+            yield SceneSweep(SICK, index, time_s, pose, points)
+
+
+def _read_line(path: Path) -> tuple[NDArray[np.float32], int]:
+    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane (source: the data set's reader); and its beams without a return."""
+    pairs, returns = read_float_rows(path, 2, "SICK line", axes=2)
+    pairs = pairs[returns]
+    return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1), int((~returns).sum())
+
+
+# --- labels and boxes -------------------------------------------------------------------------------------------------
+
+
+def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[str, NDArray[Any]]:
+    """Semantics and their confidence, where the data set has them."""
+    path = folders.semantics(camera, "semantic", number)
+    if not path.is_file():
+        return {}
+    ids = _grey(path)
+    if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
+        raise InputError("semantic image holds ids that do not exist", where=str(path),
+            expected=f"0..{_LAST_ID}, 8 bits")  # fmt: skip
+    table = np.full(256, UNLABELLED, np.uint8)
+    table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
+    labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
+    path = folders.semantics(camera, "confidence", number)
+    if path.is_file():
+        grey = _grey(path)
+        scale = np.float32(255 if grey.dtype == np.uint8 else 65535)
+        labels["semantics_confidence"] = fit.ids(grey.astype(np.float32) / scale)
+    return labels
+
+
+def _grey(path: Path) -> NDArray[Any]:
+    """A PNG of one channel, u8 or u16 [H, W]."""
+    try:
+        with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG",)) as image:
+            if image.mode not in ("L", "P", "I;16", "I"):
+                raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
+                    expected="8 or 16 bits")  # fmt: skip
+            array = np.array(image)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
+        raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
+    return array if array.dtype == np.uint8 else array.astype(np.uint16)
+
+
+def _read_tracks(
+    folders: _Folders,
+    options: ImportOptions,
+    time_of: Mapping[int, float],
+    world_from_source: Matrix,
+    notes: list[str],
+) -> list[Track]:
+    """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn in."""
+    path = options.boxes or layout.first_file(*folders.boxes())
+    if path is None:
+        notes.append("no boxes found: everything counts as static")
+        return []
+    notes.append(f"boxes from {path.parent.name}/{path.name}")
+    numbers = np.array(sorted(time_of))
+    tracks = BoxTracks(str(path), LABEL_OF)
+    left_out: Counter[str] = Counter()
+    outside = 0
+    standing: dict[str, tuple[Kitti360Box, list[int]]] = {}
+    moving: dict[str, set[int]] = {}
+
+    def add(name: str, box: Kitti360Box, frame: int) -> None:
+        pose, still = world_from_source @ box.world_from_box, box.frame < 0
+        tracks.add(name, tracks.label_of(box.label), time_of[frame], box.size_m, pose, standing=still)
+
+    for box in read_boxes(path, left_out):
+        if box.frame < 0:
+            inside = numbers[(numbers >= box.window[0]) & (numbers <= box.window[1])]
+            outside += not len(inside)
+            if len(inside):
+                standing.setdefault(box.object_id, (box, []))[1].extend((int(inside[0]), int(inside[-1])))
+            continue
+        seen = moving.setdefault(box.object_id, set())
+        if box.frame in seen:  # the parts of a drive overlap; the data set's own reader keeps one box, too
+            left_out["that an object has twice in a frame"] += 1
+        elif box.frame in time_of:
+            seen.add(box.frame)
+            add(box.object_id, box, box.frame)
+        else:
+            outside += 1
+    for name, (box, frames) in standing.items():
+        for frame in dict.fromkeys((min(frames), max(frames))):
+            add(f"s-{name}" if name in moving else name, box, frame)
+    if outside:
+        notes.append(f"{outside} boxes lie outside the imported frames and were left out")
+    notes += [f"{count} boxes {what} were left out" for what, count in left_out.items()]
+    result, track_notes = tracks.tracks()
+    notes += track_notes
+    return result

@@ -1,0 +1,590 @@
+"""nuScenes importer: one scene of a release (``v1.0-mini``, ``v1.0-trainval``, ``v1.0-test``), or one annotated key frame.
+
+What is read, below the release's root:
+
+============== ==========================================================================================
+``v1.0-*``     the tables: scene, log, sample, sample_data, ego_pose, calibrated_sensor, sensor; and, where
+               there are annotations, sample_annotation, instance, category, attribute
+``samples``    images and sweeps of the key frames (2 Hz)
+``sweeps``     those between: six cameras at 12 Hz, ``LIDAR_TOP`` at 20 Hz
+============== ==========================================================================================
+
+Each image and sweep has a vehicle pose of its own, at its own time; nothing is interpolated but the boxes between their
+2 Hz key frames. Images are rectified by the publisher. Sweeps are compensated for the vehicle's motion inside the sensor, to the
+end of the turn, which is the sweep's time stamp.
+
+A sweep file has no point times. It holds columns of 32 returns in firing order, so the time of a point follows from its
+column; where the columns are not complete, from its azimuth: the sensor turns clockwise in 50 ms and begins 93 degrees to the
+left of forward. ``dt_s`` is therefore between -0.05 and 0. Returns from the recording vehicle itself, a quarter of all, are dropped.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log, store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
+from mudg.formats.importers import common, drive_log, layout
+from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers.clouds import read_float_rows
+from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
+from mudg.formats.importers.layout import LogFiles
+from mudg.formats.unknown_fields import note_unknown
+
+# nuScenes sensors: cameras from their intrinsics, and ``LIDAR_TOP`` files with the time of every point ----------------
+
+
+LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
+CAMERAS: Final[Mapping[str, str]] = {
+    "CAM_FRONT": "front", "CAM_FRONT_LEFT": "front_left", "CAM_FRONT_RIGHT": "front_right", "CAM_BACK": "back",
+    "CAM_BACK_LEFT": "back_left", "CAM_BACK_RIGHT": "back_right",
+}  # fmt: skip
+SENSOR: Final = "lidar_top"
+TURN_PERIOD_S: Final = 0.05
+BEAMS: Final = 32
+_FIRST_AZIMUTH_RAD: Final = np.deg2rad(-177.0)
+"""Where a turn begins, in the LiDAR's axes (x right, y forward)."""
+_OWN_VEHICLE_M: Final = ((-1.05, 1.05), (-2.2, 3.1), (-2.2, 0.5))
+"""The recording car in the LiDAR's axes: x right, y forward, z up."""
+
+
+def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, where: str) -> Camera:
+    """A camera from the release's 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
+    try:
+        k = np.array(intrinsics, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
+    off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
+    if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
+        raise InputError("intrinsics are malformed", where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            got=str(intrinsics)[:120])  # fmt: skip
+    return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
+
+
+def read_scan(path: Path) -> SweepPoints:
+    """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
+
+    Returns of the recording vehicle are dropped, and beams without a return, which are counted; intensity becomes 0..1.
+
+    Raises:
+        InputError: cut off, not finite, or rings that no 32-beam sensor has.
+    """
+    rows, returns = read_float_rows(path, 5, "sweep")
+    rings = rows[returns, 4]
+    if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
+        raise InputError("fifth value of the points is no ring number", where=str(path),
+            expected=f"whole numbers 0 to {BEAMS - 1}", got=f"{rings.min():g} to {rings.max():g}",
+            remedy="is this a file of another sensor or format?")  # fmt: skip
+    dt_s = point_times(rows[:, :3], rows[:, 4])
+    own = np.ones(len(rows), bool)
+    for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
+        own &= (rows[:, axis] > low) & (rows[:, axis] < high)
+    chosen = returns & ~own
+    xyz, intensity = np.ascontiguousarray(rows[chosen, :3]), (rows[chosen, 3] / 255).clip(0, 1).astype(np.float32)
+    return SweepPoints(xyz, intensity, dt_s[chosen], no_returns=int((~returns).sum()))
+
+
+def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray[np.float32]:
+    """When each point was measured, f32[N] seconds relative to the end of the turn (-0.05..0).
+
+    By column where all 32 returns of every column are there in firing order, else by azimuth.
+    """
+    columns = len(rings) // BEAMS
+    if columns > 1 and len(rings) == columns * BEAMS and (rings.reshape(-1, BEAMS) == np.arange(BEAMS)).all():
+        fraction = (np.arange(len(rings)) // BEAMS + 1) / columns
+    else:
+        azimuth = np.arctan2(xyz[:, 1].astype(np.float64), xyz[:, 0].astype(np.float64))
+        fraction = np.mod(_FIRST_AZIMUTH_RAD - azimuth, 2 * np.pi) / (2 * np.pi)
+    return ((fraction - 1) * TURN_PERIOD_S).astype(np.float32)
+
+
+# tables ---------------------------------------------------------------------------------------------------------------
+#
+# The tables of a nuScenes release: JSON arrays of flat records, read one record at a time.
+#
+# The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each). What an
+# import needs of them is one scene, so records are found by the value of one field while the file passes through a
+# buffer of a few megabytes; only matching records become Python objects.
+
+
+_BUFFER_BYTES: Final = 1 << 22
+_MAX_RECORD_BYTES: Final = 1 << 20
+_FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
+"""An object whose fields are not objects; braces may stand in its texts."""
+_RECORD: Final = functools.reduce(lambda inner, _: _FLAT_RECORD.replace(rb')*+\}', b"|" + inner + rb')*+\}'), range(3), _FLAT_RECORD)
+"""An object with objects in it, three deep: the data set has none, but programs add fields of their own."""
+_FLAT: Final = re.compile(_FLAT_RECORD, re.DOTALL)
+_ENTRY: Final = re.compile(rb"\s*+(,?)\s*+(" + _RECORD + rb"|\])", re.DOTALL)
+_TOKEN: Final = re.compile(r"[A-Za-z0-9_\-]{1,128}")
+
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    "attribute.json": frozenset({"token", "name", "description"}),
+    "calibrated_sensor.json": frozenset({"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}),
+    "category.json": frozenset({"token", "name", "description", "index"}),
+    "ego_pose.json": frozenset({"token", "timestamp", "translation", "rotation"}),
+    "instance.json": frozenset({
+        "token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token",
+    }),
+    "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
+    "sample_annotation.json": frozenset({
+        "token", "sample_token", "instance_token", "attribute_tokens", "visibility_token", "translation", "size", "rotation",
+        "num_lidar_pts", "num_radar_pts", "next", "prev",
+    }),
+    "sample_data.json": frozenset({
+        "token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "fileformat", "width", "height", "timestamp",
+        "is_key_frame", "next", "prev",
+    }),
+    "scene.json": frozenset({
+        "token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token",
+    }),
+    "sensor.json": frozenset({"token", "channel", "modality"}),
+}  # fmt: skip
+"""Tables that are read -> their fields. Source: the release's published schema; ``index`` came with nuScenes-lidarseg."""
+
+Row = dict[str, Any]
+
+
+def iter_records(path: Path, *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[Row]:
+    """Every record of a table, in file order. The file is read in pieces; one record is an object at a time.
+
+    Raises:
+        InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off.
+    """
+    with _open(path) as file:
+        buffer, offset, first = _start_of_array(file, path, buffer_bytes), 0, True
+        position = buffer.index(b"[") + 1
+        while True:
+            entry = _ENTRY.match(buffer, position)
+            if entry is None:
+                piece, rest = file.read(buffer_bytes), buffer[position:]
+                if not piece and rest.lstrip()[:1] in (b"", b",", b"{"):
+                    raise _cut_off(path)
+                if not piece or len(rest) > _MAX_RECORD_BYTES:
+                    raise _no_records(path, offset + position, rest)
+                buffer, offset, position = rest + piece, offset + position, 0
+                continue
+            if entry[2] == b"]" and not entry[1]:
+                return
+            if entry[2] == b"]" or first == bool(entry[1]):
+                raise _no_records(path, offset + position, entry[0])
+            yield _parse(entry[2], path, offset + entry.start(2))
+            first, position = False, entry.end()
+
+
+def find_records(
+    path: Path, field: str, values: Collection[str], *, buffer_bytes: int = _BUFFER_BYTES
+) -> Iterator[Row]:
+    """Records whose text ``field`` is one of ``values``, in file order.
+
+    Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit is cut
+    out and parsed strictly. Where that fails (braces inside texts) every record is parsed instead. The file's first and
+    last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes.
+
+    Raises:
+        InputError: no JSON array, a matching record that is malformed, or the file is cut off.
+    """
+    found = 0
+    try:
+        for record in _search(path, field, values, buffer_bytes):
+            found += 1
+            yield record
+    except _Unclear:
+        matching = (r for r in iter_records(path, buffer_bytes=buffer_bytes) if r.get(field) in values)
+        yield from itertools.islice(matching, found, None)
+
+
+class _Unclear(Exception):
+    """The bytes around a hit are no record: the quick search cannot go on."""
+
+
+def _search(path: Path, field: str, values: Collection[str], buffer_bytes: int) -> Iterator[Row]:
+    wanted = {value.encode() for value in values}
+    hit = re.compile(rb'"' + re.escape(field.encode()) + rb'"\s*:\s*"([^"\\]*)"')
+    with _open(path) as file:
+        buffer, offset, piece = _start_of_array(file, path, buffer_bytes), 0, b" "
+        while piece:
+            piece = file.read(buffer_bytes)
+            buffer += piece
+            # what follows the last closing brace may be half a record: it waits for the next piece
+            end = buffer.rfind(b"}") + 1
+            for match in hit.finditer(buffer, 0, end):
+                if match[1] in wanted:
+                    record = _FLAT.match(buffer, max(0, buffer.rfind(b"{", 0, match.start())))
+                    if record is None or record.end() <= match.start():
+                        raise _Unclear
+                    yield _parse(record[0], path, offset + record.start())
+            if not piece and not buffer.rstrip().endswith(b"]"):
+                raise _cut_off(path)
+            if len(buffer) - end > _MAX_RECORD_BYTES + buffer_bytes:
+                raise _no_records(path, offset + end, buffer[end:])
+            buffer, offset = buffer[end:], offset + end
+
+
+def _parse(content: bytes, path: Path, byte: int) -> Row:
+    try:
+        record = json.loads(content, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise InputError("table record is not valid JSON", where=f"{path}: byte {byte}", got=str(error)) from error
+    if path.name in OFFICIAL:
+        note_unknown(path.name, record, OFFICIAL[path.name])
+    return record
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _open(path: Path) -> BinaryIO:
+    if not path.exists():
+        raise InputError("table is missing", where=str(path),
+            remedy="unpack the release's metadata archive, which holds all tables")  # fmt: skip
+    return store.open_file(path)
+
+
+def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:
+    """The first piece of the file, to its opening bracket at least."""
+    start = file.read(buffer_bytes)
+    if start.lstrip()[:1] != b"[":
+        raise InputError("table does not start as a JSON array", where=str(path), expected="[ {...}, ... ]",
+            got=repr(start[:20]) if start else "an empty file", remedy="copy the table again")  # fmt: skip
+    return start
+
+
+def _cut_off(path: Path) -> InputError:
+    expected = "a JSON array closed by ]"
+    return InputError("table is cut off", where=str(path), expected=expected, remedy="copy the table again")
+
+
+def _no_records(path: Path, place: int, got: bytes) -> InputError:
+    return InputError("table is not an array of records", where=f"{path}: byte {place}", got=repr(got[:20]),
+        expected="flat records {...} of less than 1 MiB between commas")  # fmt: skip
+
+
+# --- rows -----------------------------------------------------------------------------------------------------------
+
+
+def text(row: Row, key: str, where: str) -> str:
+    """A text field."""
+    value = row.get(key)
+    if not isinstance(value, str):
+        raise _bad_field(row, key, where, "a text")
+    return value
+
+
+def integer(row: Row, key: str, where: str) -> int:
+    """An integer field."""
+    value = row.get(key)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise _bad_field(row, key, where, "an integer")
+    return value
+
+
+def numbers(row: Row, key: str, count: int, where: str) -> list[float]:
+    """A field that is a list of ``count`` numbers."""
+    value = row.get(key)
+    if not isinstance(value, list) or len(value) != count or not all(_is_number(item) for item in value):
+        raise _bad_field(row, key, where, f"{count} numbers")
+    return [float(item) for item in value]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
+    return InputError(f"field {key!r} is missing or malformed", where=f"{where}: record {row.get('token', '?')!r}",
+        expected=expected, got=repr(row.get(key))[:120])  # fmt: skip
+
+
+class TokenTable:
+    """Records of one table by their token; asking for one that is not there names who refers to it."""
+
+    def __init__(self, path: Path, records: Iterator[Row]) -> None:
+        self.where = str(path)
+        self.rows: dict[str, Row] = {}
+        for row in records:
+            token = row.get("token")
+            if not isinstance(token, str) or not _TOKEN.fullmatch(token):
+                raise InputError("record has no token", where=self.where, got=repr(token)[:80])
+            if self.rows.setdefault(token, row) is not row:
+                raise InputError("two records have one token", where=self.where, got=token)
+
+    def record(self, token: Any, where: str) -> Row:
+        """The record of a token; ``where`` says who refers to it."""
+        if not isinstance(token, str) or token not in self.rows:
+            raise InputError("a token points nowhere", where=where, got=repr(token),
+                expected=f"a record of {self.where}", remedy="are the tables of one release, and complete?")  # fmt: skip
+        return self.rows[token]
+
+    def get(self, row: Row, key: str, where: str) -> Row:
+        """The record that field ``key`` of ``row`` (in table ``where``) refers to."""
+        return self.record(row.get(key), f"{where}: record {row.get('token', '?')!r}: {key}")
+
+
+# importer -------------------------------------------------------------------------------------------------------------
+
+
+Matrix = NDArray[np.float64]
+
+LIDAR: Final = "LIDAR_TOP"
+MAX_GAP_S: Final = 1.1
+"""Boxes are annotated every 0.5 s; across one that is missing a track goes on, across two it does not."""
+MICROSECONDS: Final = 10**6
+_MAX_BEFORE_SCENE_S: Final = 1.0
+
+LABELS: Final[Mapping[str, str]] = {
+    "animal": "animal", "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.personal_mobility": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian", "human.pedestrian.stroller": "stroller",
+    "human.pedestrian.wheelchair": "wheelchair", "movable_object.barrier": "barrier",
+    "movable_object.debris": "debris", "movable_object.pushable_pullable": "pushable",
+    "movable_object.trafficcone": "traffic_cone", "static_object.bicycle_rack": "bicycle_rack",
+    "vehicle.bicycle": "bicycle", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus", "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle", "vehicle.emergency.ambulance": "van",
+    "vehicle.emergency.police": "car", "vehicle.motorcycle": "motorcycle", "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+}  # fmt: skip
+"""The release's categories -> labels."""
+_RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
+_WITH_RIDER: Final = "cycle.with_rider"
+
+
+def looks_like_nuscenes(source: Path) -> bool:
+    """Whether a folder holds nuScenes tables, or is a table folder."""
+    return bool(_releases(source))
+
+
+def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one scene of a nuScenes release into the scene directory ``out``; see the module text for what is read.
+
+    Args:
+        source: the release's root, or its table folder.
+        options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie side
+            by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by default.
+
+    Raises:
+        UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    if not source.is_dir():
+        raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
+    layout.refuse_untwist(options, "nuScenes", str(source))
+    releases = _releases(source)
+    if not releases:
+        raise InputError("no nuScenes tables found", where=str(source), got=layout.folder_contents(source),
+            expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
+            remedy="give the folder that holds v1.0-*, samples and sweeps")  # fmt: skip
+    return drive_log.write_log(read_log(releases, options), out, options)
+
+
+def _releases(source: Path) -> list[Path]:
+    """Table folders: ``source`` itself, or those called ``v1.0-...`` in it; smallest first."""
+    folders = [source, *sorted(source.glob("v1.0-*"))] if source.is_dir() else []
+    found = [f for f in folders if (f / "scene.json").is_file() and (f / "sample_data.json").is_file()]
+    return sorted(found, key=lambda folder: (folder / "scene.json").stat().st_size)
+
+
+def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
+    """The tables, and which files there are beside them: which of those belong to a scene only the large tables know."""
+    tables_of = tuple(table for folder in _releases(source) for table in sorted(folder.glob("*.json")))
+    if not tables_of:
+        return LogFiles((source,))
+    root = tables_of[0].parent.parent
+    sensors = [path for name in ("samples", "sweeps") for path in sorted(root.glob(f"{name}/*")) if path.is_dir()]
+    return LogFiles(tables_of, tuple(sensors))
+
+
+# --- one scene ------------------------------------------------------------------------------------------------------
+
+
+def _all_of(folder: Path, name: str) -> TokenTable:
+    """A small table, complete."""
+    path = folder / f"{name}.json"
+    return TokenTable(path, iter_records(path))
+
+
+def _those(folder: Path, name: str, field: str, values: set[str]) -> TokenTable:
+    """The records of a large table whose ``field`` is one of ``values``."""
+    path = folder / f"{name}.json"
+    return TokenTable(path, find_records(path, field, values))
+
+
+def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
+    """What the tables tell about the chosen scene; no image or sweep is opened."""
+    folder, scene = _choose_scene(releases, options)
+    where = f"{folder}: {scene['name']}"
+    log.info(f"nuscenes: {where}")
+    samples = _samples_in_order(folder, scene)
+    data = _those(folder, "sample_data", "sample_token", set(samples))
+    sensors, calibrations = _all_of(folder, "sensor"), _all_of(folder, "calibrated_sensor")
+    channel_of: dict[str, str] = {}
+    for row in data.rows.values():
+        calibration = calibrations.get(row, "calibrated_sensor_token", data.where)
+        sensor = sensors.get(calibration, "sensor_token", calibrations.where)
+        channel_of[row["token"]] = text(sensor, "channel", sensors.where)
+    there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
+    chosen = {there[raw]: raw for raw in layout.chosen_cameras(there, options, where, tuple(CAMERAS))}
+    layout.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
+    used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
+    _check_times(used, samples, data.where)
+    used.sort(key=lambda row: row["timestamp"])
+    ego_poses = _those(folder, "ego_pose", "token", {text(r, "ego_pose_token", data.where) for r in used})
+    zero_us = int(used[0]["timestamp"])
+    reader = _RowReader(folder.parent, data.where, calibrations, ego_poses, zero_us)
+    scene_name_of = {raw: name for name, raw in chosen.items()}
+    images, sweeps = [], []
+    rows_of: dict[str, Row] = {}
+    for row in used:
+        channel = channel_of[row["token"]]
+        if channel == LIDAR:
+            sweeps.append(reader.sweep(row))
+        else:
+            images.append(reader.image(row, scene_name_of[channel]))
+            rows_of.setdefault(channel, row)
+    cameras = {name: reader.camera(rows_of[raw], name) for name, raw in chosen.items() if raw in rows_of}
+    tracks, notes = _read_tracks(folder, samples, zero_us)
+    if not sweeps:
+        notes.append("no LiDAR sweeps in the tables")
+    ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
+    source = Source("nuscenes", LICENCE, None, (f"release {folder.name}, {scene['name']}", *notes))
+    return DriveLog(str(scene["name"]), cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+
+
+def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Path, Row]:
+    wanted_release, _, wanted = options.sequence.rpartition("/")
+    found: list[tuple[Path, Row]] = []
+    names: list[str] = []
+    for folder in releases:
+        if wanted_release and folder.name != wanted_release:
+            continue
+        for row in iter_records(folder / "scene.json"):
+            name = text(row, "name", str(folder / "scene.json"))
+            names.append(f"{folder.name}/{name}" if len(releases) > 1 else name)
+            if wanted in ("", name, row.get("token")):
+                found.append((folder, row))
+    # the same scene may lie in two releases: the smaller one is quicker
+    return layout.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
+
+
+def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
+    """Key frames of a scene: token -> time stamp in microseconds, in the order of the chain."""
+    where = str(folder / "scene.json")
+    token = text(scene, "token", where)
+    samples = _those(folder, "sample", "scene_token", {token})
+    at = text(scene, "first_sample_token", where)
+    stamps: dict[str, int] = {}
+    while at:
+        if at in stamps:
+            raise InputError("the chain of key frames runs in a circle", where=samples.where, got=f"back at {at!r}")
+        stamps[at] = integer(samples.record(at, samples.where), "timestamp", samples.where)
+        at = text(samples.rows[at], "next", samples.where)
+    values = np.array(list(stamps.values()), np.int64)
+    common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
+    if (np.diff(values) <= 0).any():
+        late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
+        raise InputError("time stamps of key frames do not increase along the scene",
+            where=f"{samples.where}: record {late!r}", got=f"{stamps[late]} after a later one",
+            expected="microseconds, increasing from one key frame to the next", remedy="copy the table again")  # fmt: skip
+    return stamps
+
+
+def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) -> None:
+    """Stamps of images and sweeps are microseconds near their scene."""
+    stamps = np.array([integer(row, "timestamp", where) for row in rows], np.int64)
+    common.check_epoch(stamps, MICROSECONDS, f"{where}: timestamp")
+    first, last = min(samples.values()), max(samples.values())
+    beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
+    if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
+        raise InputError("an image or sweep lies outside its scene's time",
+            where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
+            got=f"{beside.max():.3f} s away from the key frames", expected="microseconds since 1970, within the scene")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _RowReader:
+    """Records of ``sample_data`` to images and sweeps with their poses."""
+
+    root: Path
+    where: str
+    calibrations: TokenTable
+    ego_poses: TokenTable
+    zero_us: int
+
+    def time_s(self, row: Row) -> float:
+        return (int(row["timestamp"]) - self.zero_us) / MICROSECONDS
+
+    def map_from_ego(self, row: Row) -> Matrix:
+        return _pose(self.ego_poses.get(row, "ego_pose_token", self.where), self.ego_poses.where)
+
+    def map_from_sensor(self, row: Row) -> Matrix:
+        calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
+        return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
+
+    def file(self, row: Row) -> Path:
+        return layout.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+
+    def image(self, row: Row, camera: str) -> ImageRecord:
+        return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))
+
+    def sweep(self, row: Row) -> SweepRecord:
+        path = self.file(row)
+        return SweepRecord(SENSOR, self.time_s(row), self.map_from_sensor(row), path, partial(read_scan, path))
+
+    def camera(self, row: Row, name: str) -> Camera:
+        calibration = self.calibrations.get(row, "calibrated_sensor_token", self.where)
+        where = f"{self.calibrations.where}: record {calibration['token']!r}"
+        size = integer(row, "width", self.where), integer(row, "height", self.where)
+        return camera_from_intrinsics(name, size, calibration.get("camera_intrinsic"), where)
+
+
+def _pose(row: Row, where: str) -> Matrix:
+    """Rigid f64[4, 4] of a record with ``rotation`` (w, x, y, z) and ``translation``."""
+    rotation, translation = numbers(row, "rotation", 4, where), numbers(row, "translation", 3, where)
+    return common.pose_from_quaternion(rotation, translation, f"{where}: record {row.get('token', '?')!r}")
+
+
+# --- boxes ----------------------------------------------------------------------------------------------------------
+
+
+def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tuple[list[Track], list[str]]:
+    """Tracks of the whole scene in the map's frame, and notes; a release without annotations has none."""
+    if not (folder / "sample_annotation.json").is_file():
+        return [], ["no annotations in this release: everything counts as static"]
+    annotations = _those(folder, "sample_annotation", "sample_token", set(samples))
+    instances = _those(folder, "instance", "token", {str(r.get("instance_token")) for r in annotations.rows.values()})
+    categories = _all_of(folder, "category")
+    attributes = _all_of(folder, "attribute") if (folder / "attribute.json").is_file() else None
+    tracks = BoxTracks(annotations.where, LABELS, MAX_GAP_S)
+    for row in annotations.rows.values():
+        instance = instances.get(row, "instance_token", annotations.where)
+        category = categories.get(instance, "category_token", instances.where)
+        label = tracks.label_of(text(category, "name", categories.where))
+        if attributes is not None and label in _RIDDEN and _is_ridden(row, attributes):
+            label = _RIDDEN[label]
+        width, length, height = numbers(row, "size", 3, annotations.where)  # in this order in the tables
+        where = f"{annotations.where}: record {row['token']!r}"
+        time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
+        tracks.add(
+            instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where
+        )
+    return tracks.tracks()
+
+
+def _is_ridden(row: Row, attributes: TokenTable) -> bool:
+    tokens = row.get("attribute_tokens")
+    return isinstance(tokens, list) and any(
+        attributes.rows.get(token, {}).get("name") == _WITH_RIDER for token in tokens if isinstance(token, str)
+    )

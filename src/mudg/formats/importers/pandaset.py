@@ -1,0 +1,758 @@
+"""PandaSet importer: one sequence folder (``001``, ``002``, ...) of 80 frames at 10 Hz.
+
+========================================= ================================================================================
+``camera/<name>/NN.jpg``                   six cameras, rectified; ``intrinsics.json``, ``poses.json``, ``timestamps.json``
+``lidar/NN.pkl.gz``                        points of both LiDARs in the world: x y z, i (0..255), t (s), d (which LiDAR)
+``lidar/poses.json``, ``timestamps.json``  pose of the vehicle (x right, y forward, z up), not of a LiDAR
+``annotations/cuboids/NN.pkl.gz``          boxes in the world
+``annotations/semseg/NN.pkl.gz``           class of every point; ``classes.json`` names them
+========================================= ================================================================================
+
+The tables are pickled pandas frames. They are read by ``pandas_frame``, which runs nothing of them and needs no pandas.
+
+Frames. World: z up, origin and x axis at the vehicle of the first frame. The given points are motion-compensated: each lies
+where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDARs become two sensors, ``pandar64`` (d = 0) and
+``pandar_gt`` (d = 1, solid state, looks forward). Their places on the vehicle follow from the front camera's recorded
+poses and the published static calibration. A cloud is filed under the end of its turn, 0.05 s after its middle and after the front
+camera's image; a sweep here stands at the middle.
+
+Images. Measured on sequence 002 (see docs/formats/pandaset.md), images show what moves as it was ``EXPOSURE_S`` from their time stamp, and
+fit standing points when the camera is taken ``POSE_S`` along the vehicle's path. Both are applied to all cameras.
+
+Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs look
+carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning LiDAR's box is
+kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s apart: 1 m at 20 m/s);
+it is moved to the sweep's time with its track's velocity.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log, palette, store
+from mudg.base.errors import InputError
+from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
+from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
+from mudg.formats.importers import layout
+from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers.common import (
+    ImportOptions,
+    finite_columns,
+    mended_path,
+    origin_note,
+    pose_from_quaternion,
+    pose_near,
+    record_fields,
+    require_columns,
+    returns_of,
+    seconds,
+    world_from_first,
+)
+from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
+from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
+from mudg.formats.importers.layout import LogFiles
+from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
+
+# pandas frame ---------------------------------------------------------------------------------------------------------
+#
+# Tables that pandas pickled, read as columns of numpy arrays without pandas and without running the pickle.
+#
+# The forms of pandas 0.2x, 1.x and 2.x are understood: a data frame is a manager of blocks, each block an array of several
+# columns and the places of these columns. Extension types (categories, text arrays of pandas 3) are refused by name.
+
+
+_MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
+MAX_COLUMNS: Final = 1000
+_NEW_BLOCK: Final = "pandas.core.internals.blocks.new_block"
+
+
+def _new_index(kind: Any, entries: Any) -> NDArray[Any] | range:
+    if not isinstance(kind, Name) or not isinstance(entries, dict):
+        raise ValueError("an index of unknown form")
+    if kind.text.endswith("RangeIndex"):
+        return range(entries["start"], entries["stop"], entries["step"])
+    return _array(entries["data"])
+
+
+def _slice(start: Any, stop: Any, step: Any) -> slice:
+    if not all(part is None or isinstance(part, int) for part in (start, stop, step)):
+        raise ValueError("a slice that is not of whole numbers")
+    return slice(start, stop, step)
+
+
+def _block(values: Any, places: Any, _dimensions: Any) -> tuple[Any, Any]:
+    return values, places
+
+
+_MAKERS: Final[Mapping[str, Maker | None]] = {
+    **NUMPY_MAKERS,
+    "pandas.core.frame.DataFrame": None,
+    **dict.fromkeys(_MANAGERS),
+    "pandas.core.indexes.base._new_Index": _new_index,
+    "pandas.core.indexes.base.Index": None,
+    **dict.fromkeys(f"pandas.core.indexes.numeric.{kind}Index" for kind in ("Int64", "UInt64", "Float64")),
+    "pandas.core.indexes.range.RangeIndex": None,
+    "pandas._libs.internals._unpickle_block": _block,
+    _NEW_BLOCK: None,
+    "functools.partial": None,
+    "builtins.slice": _slice,
+}
+
+
+def read_frame(path: Path) -> dict[str, NDArray[Any]]:
+    """Columns of a pickled, gzipped data frame (``.pkl.gz``; plain ``.pkl`` too), by their names.
+
+    Raises:
+        InputError: missing, cut off, not a data frame, or it asks for something that is not plain data.
+    """
+    content = store.read_bytes(path)
+    if content[:2] == b"\x1f\x8b":
+        content = gunzip(content, str(path))
+    return parse_frame(content, str(path))
+
+
+def gunzip(content: bytes, where: str) -> bytes:
+    """Unpack gzip, not beyond ``MAX_BYTES``.
+
+    Raises:
+        InputError: cut off, damaged, or larger than that.
+    """
+    unpacker = zlib.decompressobj(wbits=31)
+    try:
+        unpacked = unpacker.decompress(content, MAX_BYTES + 1)
+    except zlib.error as error:
+        raise InputError("gzip file is damaged", where=where, got=str(error), remedy="copy the file again") from error
+    if len(unpacked) > MAX_BYTES:
+        raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
+    if not unpacker.eof:
+        raise InputError("gzip file is cut off", where=where, got=f"{len(content)} bytes, no end",
+            remedy="copy the file again")  # fmt: skip
+    return unpacked
+
+
+def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """Columns of a pickled data frame; see ``read_frame``."""
+    value = read_pickle(content, where, _MAKERS)
+    try:
+        return _columns_pandas_frame(value)
+    except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError("pickle is not a plain data frame", where=where,
+            expected="a table of numbers and texts as pandas 0.2x to 2.x writes it",
+            got=f"{type(error).__name__}: {error}"[:200],
+            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2") from error  # fmt: skip
+
+
+def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
+    if not isinstance(frame, PickledObject) or frame.name != "pandas.core.frame.DataFrame":
+        raise ValueError(f"holds a {getattr(frame, 'name', type(frame).__name__)}")
+    manager = frame.state["_mgr"] if "_mgr" in frame.state else frame.state["_data"]
+    if manager.name not in _MANAGERS:
+        raise ValueError(f"holds a {manager.name}")
+    if manager.arguments:
+        blocks, axes = manager.arguments
+        parts = [_block_parts(block) for block in blocks]
+    else:
+        extra = manager.state[3]["0.14.1"]
+        axes = extra["axes"]
+        parts = [(block["values"], block["mgr_locs"]) for block in extra["blocks"]]
+    if len(axes[0]) > MAX_COLUMNS:
+        raise ValueError(f"a table of {len(axes[0])} columns")
+    names = [str(name) for name in axes[0]]
+    rows = len(axes[1])
+    columns: dict[str, NDArray[Any]] = {}
+    for values, places in parts:
+        array = _array(values)
+        chosen = np.arange(len(names))[places if isinstance(places, slice) else _array(places)]
+        if array.shape != (len(chosen), rows):
+            raise ValueError(f"a block of shape {array.shape} for {len(chosen)} columns and {rows} rows")
+        for place, column in zip(chosen, array, strict=True):
+            columns[names[place]] = column
+    if len(columns) != len(names):
+        raise ValueError(f"{len(columns)} of {len(names)} columns are there")
+    return {name: columns[name] for name in names}
+
+
+def _block_parts(block: Any) -> tuple[Any, Any]:
+    """Values and places of a block in the forms of pandas 1.3 (a partial call) and later (a tuple)."""
+    if isinstance(block, PickledObject):
+        if block.name != "functools.partial":
+            raise ValueError(f"a block is a {block.name}")
+        partial, values, places = block.arguments
+        if partial.arguments != (Name(_NEW_BLOCK),):
+            raise ValueError("a block of unknown form")
+        return values, places
+    values, places = block
+    return values, places
+
+
+def _array(value: Any) -> NDArray[Any]:
+    if isinstance(value, np.ndarray):
+        return value
+    if not isinstance(value, Array) or value.value is None:
+        raise ValueError(f"a column is a {getattr(value, 'name', type(value).__name__)}, not a plain array")
+    return value.value
+
+
+# classes that people gave to PandaSet's points: ``annotations/semseg`` -> train ids of ``base/palette.py`` ------------
+
+
+CLASS_OF: Final[dict[str, str]] = {
+    "Smoke": "", "Exhaust": "", "Spray or rain": "",  # no surface
+    "Reflection": "",  # a ghost: nothing is there
+    "Vegetation": "vegetation",
+    "Ground": "terrain",  # unpaved ground
+    "Road": "road", "Lane Line Marking": "road", "Stop Line Marking": "road", "Other Road Marking": "road",
+    "Sidewalk": "sidewalk",
+    "Driveway": "",  # crosses the sidewalk and is driven on: people label it either way
+    "Car": "car",
+    "Pickup Truck": "truck",  # by definition of Cityscapes, as their boxes here
+    "Medium-sized Truck": "truck", "Semi-truck": "truck",
+    "Towed Object": "",  # trailers behind cars have no class of their own
+    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle",
+    "Other Vehicle - Construction Vehicle": "truck",
+    "Other Vehicle - Uncommon": "", "Other Vehicle - Pedicab": "",
+    "Emergency Vehicle": "",  # cars and trucks
+    "Bus": "bus",
+    "Personal Mobility Device": "",
+    "Bicycle": "bicycle",
+    "Train": "train", "Trolley": "train", "Tram / Subway": "train",
+    "Pedestrian": "person", "Pedestrian with Object": "person",
+    "Animals - Bird": "", "Animals - Other": "",
+    "Pylons": "", "Cones": "", "Rolling Containers": "",
+    "Road Barriers": "", "Temporary Construction Barriers": "",  # walls, fences and guard rails
+    "Signs": "traffic sign", "Construction Signs": "traffic sign",
+    "Building": "building",
+    "Other Static Object": "",  # poles, traffic lights, walls, fences and more
+}  # fmt: skip
+"""The data set's classes -> classes of ``palette.CLASSES``; empty = unlabelled, because no class or several would fit."""
+
+
+class PointClasses:
+    """The class tables of the chosen frames.
+
+    Args:
+        folder: ``annotations/semseg``. Without any table there no point has a class.
+        frames: numbers of the chosen frames.
+        options: ``skip_missing`` allows frames without a table.
+
+    Raises:
+        InputError: a frame has no table though others have one, or ``classes.json`` is missing or malformed.
+    """
+
+    def __init__(self, folder: Path, frames: Sequence[int], options: ImportOptions) -> None:
+        self._files: dict[int, Path] = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+        lacks = [number for number in frames if number not in self._files]
+        if self._files and lacks and not options.skip_missing:
+            raise InputError("a frame has no classes of points", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz",
+                remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        self._names = _names(folder / "classes.json") if self._files else {}
+        unknown = sorted(set(self._names.values()) - set(CLASS_OF))
+        self.notes = (
+            [f"classes of points that are not known here are unlabelled: {', '.join(unknown[:8])}"] if unknown else []
+        )
+        """Sentences about the tables, for people."""
+
+    def of(self, frame: int, points: int) -> NDArray[np.uint8] | None:
+        """Train ids u8[points] of a frame's cloud, 255 where unlabelled; None for a frame without a table."""
+        path = self._files.get(frame)
+        if path is None:
+            return None
+        table = read_frame(path)
+        require_columns(("class",), table, path)
+        note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
+        numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
+        if len(numbers) != points:
+            raise InputError("classes do not fit the points", where=f"{path}: class", got=f"{len(numbers)} rows",
+                expected=f"{points} rows, one for each point of the frame's cloud",
+                remedy="is the file of another frame or sequence?")  # fmt: skip
+        return self._train_ids(numbers, path)
+
+    def _train_ids(self, numbers: NDArray[np.int64], path: Path) -> NDArray[np.uint8]:
+        present, where = np.unique(numbers, return_inverse=True)
+        strange = [int(number) for number in present if int(number) not in self._names]
+        if strange:
+            log.warn(f"pandaset: {path}: classes {strange[:8]} are not in classes.json; their points are unlabelled")
+        ids = [train_id(self._names.get(int(number), "")) for number in present]
+        return np.array(ids, np.uint8)[where]
+
+
+def train_id(name: str) -> int:
+    """The train id of one of the data set's classes; ``UNLABELLED`` where it has none."""
+    return palette.ID.get(CLASS_OF.get(name, ""), palette.UNLABELLED)
+
+
+def _names(path: Path) -> Mapping[int, str]:
+    """Number -> name of the data set's classes."""
+    if not path.is_file():
+        raise InputError("table of class names is missing", where=str(path), expected='{"1": "Smoke", ...}',
+            remedy="copy annotations/semseg/classes.json, or leave out annotations/semseg")  # fmt: skip
+    values: Any = store.read_json(path)
+    if not isinstance(values, dict) or not all(str(key).isdigit() and isinstance(values[key], str) for key in values):
+        raise InputError("table of class names is malformed", where=str(path), expected='{"1": "Smoke", ...}',
+            got=str(values)[:80])  # fmt: skip
+    return {int(key): name for key, name in values.items()}
+
+
+# importer -------------------------------------------------------------------------------------------------------------
+
+
+Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
+CAMERAS: Final = {
+    "front_camera": "front", "front_left_camera": "front_left", "front_right_camera": "front_right",
+    "left_camera": "left", "right_camera": "right", "back_camera": "back",
+}  # fmt: skip
+SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
+OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
+"""Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
+LABELS: Final = {
+    "Car": "car", "Pickup Truck": "truck", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
+    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Bicycle": "bicycle", "Bus": "bus", "Train": "train",
+    "Trolley": "tram", "Tram / Subway": "tram", "Emergency Vehicle": "vehicle", "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian", "Personal Mobility Device": "personal_mobility_device",
+    "Other Vehicle - Construction Vehicle": "vehicle", "Other Vehicle - Uncommon": "vehicle",
+    "Other Vehicle - Pedicab": "pedicab", "Animals - Bird": "animal", "Animals - Other": "animal", "Pylons": "pylon",
+    "Road Barriers": "barrier", "Cones": "traffic_cone", "Signs": "sign", "Construction Signs": "sign",
+    "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
+}  # fmt: skip
+"""The data set's classes -> labels; pickup trucks count as trucks, as in Cityscapes."""
+FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
+"""Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
+EXPOSURE_S: Final = -0.01
+"""When an image was taken, from its time stamp on, by the places of moving cars in the images of three cameras."""
+POSE_S: Final = -0.02
+"""Where on the vehicle's path the camera's pose is taken, from its time stamp on, by standing points in the images of five cameras."""
+MAX_POINT_DELAY_S: Final = 0.25
+MAX_CAMERA_DELAY_S: Final = 1.0
+_MIN_BOX_POINTS: Final = 5
+_POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
+_CUBOID_COLUMNS: Final = (
+    "uuid", "label", "yaw", "stationary", "position.x", "position.y", "position.z",
+    "dimensions.x", "dimensions.y", "dimensions.z",
+)  # fmt: skip
+_POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
+OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
+    _POINTS: frozenset(_POINT_COLUMNS),
+    _CUBOIDS: frozenset({
+        *_CUBOID_COLUMNS, "camera_used", "attributes.object_motion", "attributes.rider_status", "attributes.pedestrian_behavior",
+        "attributes.pedestrian_age", "cuboids.sibling_id", "cuboids.sensor_id",
+    }),
+    "intrinsics.json": frozenset({"fx", "fy", "cx", "cy"}),
+}  # fmt: skip
+"""Kinds of files -> their fields, read or not."""
+_POSE_FIELDS: Final[Known] = {"heading": dict.fromkeys("wxyz"), "position": dict.fromkeys("xyz")}
+
+
+@dataclass(frozen=True, slots=True)
+class _Cuboid:
+    """One row of a cuboid table; ``sibling`` is empty where there is none."""
+
+    uuid: str
+    label: str
+    time_s: float
+    late_s: float
+    size_m: tuple[float, float, float]
+    world_from_box: Matrix
+    standing: bool
+    sensor: int
+    sibling: str
+
+
+def looks_like_pandaset(source: Path) -> bool:
+    """Whether ``source`` is a sequence of PandaSet, or a folder of such sequences."""
+    if not source.is_dir():
+        return False
+    return _is_sequence(source) or bool(_sequences(source))
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / "lidar" / "poses.json").is_file() and any((folder / "camera" / name).is_dir() for name in CAMERAS)
+
+
+def _sequences(source: Path) -> list[str]:
+    return sorted(f.name for f in source.iterdir() if f.name.isdigit() and f.is_dir() and _is_sequence(f))
+
+
+def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood.
+
+    Args:
+        source: a sequence's folder, or the folder of sequences with ``options.sequence``.
+        out: destination.
+        options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``, ``resolution`` and
+            ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
+
+    Raises:
+        UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
+        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
+    layout.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
+    folder = _chosen_sequence(source, options)
+    cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
+    chosen = layout.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
+    images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
+    clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
+    frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    notes: list[str] = []
+    motion = _Motion.read(folder, frames, chosen, options, notes)
+    fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
+    cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
+    classes = PointClasses(folder / "annotations" / "semseg", frames, options)
+    notes += [
+        f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here",
+        *image_notes(fits),
+        *classes.notes,
+    ]
+    if "front_camera" not in motion.world_from_cam:
+        notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
+    if not cuboids:
+        notes.append("no boxes found: everything counts as static")
+    boxes: dict[int, list[_Cuboid]] = {}
+    images_s: dict[float, tuple[float, float]] = {}
+
+    def convert(index: int) -> Iterator[SceneImage | SceneSweep]:
+        number = frames[index]
+        for name in chosen:
+            time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
+            yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
+        cloud = _read_points(clouds[number], motion, index)
+        given = classes.of(number, len(cloud.returns))
+        given = None if given is None else given[cloud.returns]
+        for d, sensor in SENSORS.items():
+            if d == 0 or (cloud.d == d).any():
+                pose = motion.world_from_lidar(d, cloud.time_s)
+                sweep = cloud.of_sensor(d, invert(pose) @ motion.world_from_source, given)
+                yield SceneSweep(sensor, index, cloud.time_s, pose, sweep, str(clouds[number]))
+        taken_s = [float(motion.camera_s[name][index]) for name in chosen]
+        images_s[cloud.time_s] = min(taken_s), max(taken_s)
+        if number in cuboids:
+            boxes[index] = _read_cuboids(cuboids[number], cloud, motion)
+
+    def tracks() -> Tracks:
+        found = BoxTracks(str(folder / "annotations" / "cuboids"), LABELS)
+        box_notes = _add_boxes(found, boxes)
+        made, track_notes = found.tracks(images_s=images_s)
+        return made, [*box_notes, *track_notes]
+
+    origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
+    content = SceneContent(
+        folder.resolve().name, origin, fits, numbers, convert, lambda index: f"frame {frames[index]}", motion.ego(), tracks
+    )  # fmt: skip
+    return write_scene(content, out, options)
+
+
+def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
+    if not source.is_dir():
+        raise InputError("PandaSet folder does not exist", where=str(source), expected="a folder")
+    if not options.sequence and _is_sequence(source):
+        return source
+    sequences = _sequences(source)
+    if not sequences and not options.sequence:
+        raise InputError("no PandaSet sequence found", where=str(source), got=layout.folder_contents(source),
+            expected="lidar/poses.json and camera/front_camera and so on")  # fmt: skip
+    matching = [name for name in sequences if options.sequence in ("", name)]
+    return source / layout.the_only(matching, sequences, options, source, "sequence")
+
+
+def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -> dict[int, Path]:
+    """Cuboid tables by frame number; none at all is allowed, gaps are not."""
+    cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+    lacks = [number for number in frames if number not in cuboids]
+    if cuboids and lacks and not options.skip_missing:
+        raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz",
+            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+    return cuboids
+
+
+def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
+    """The chosen sequence's folder."""
+    return LogFiles((_chosen_sequence(source, options),))
+
+
+# --- poses and times ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """Times and poses, in the scene's world and clock.
+
+    Args:
+        world_from_source: the scene's world from the data set's, f64[4, 4].
+        raw_s: the data set's time of each chosen frame's cloud.
+        start_s: the data set's time that is 0 in the scene.
+        camera_s: camera -> when its images were taken, seconds of the scene's clock, f64[n].
+        world_from_cam: camera -> f64[n, 4, 4].
+        path: the vehicle, x forward, y left, z up, at the clouds' times from one before the first chosen frame on.
+        places: 0 and 1 (``d``) -> place of the LiDAR on the vehicle, f64[3].
+    """
+
+    world_from_source: Matrix
+    raw_s: NDArray[np.float64]
+    start_s: float
+    camera_s: Mapping[str, NDArray[np.float64]]
+    world_from_cam: Mapping[str, Matrix]
+    path: EgoPath
+    places: Mapping[int, Matrix]
+
+    @classmethod
+    def read(
+        cls, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
+    ) -> _Motion:
+        file = folder / "lidar" / "timestamps.json"
+        known = range(max(frames[0] - 1, 0), frames[-1] + 1)  # those of frames that are left out tell where the vehicle was, too
+        first = frames[0] - known[0]
+        raw_s = _times(file, known)
+        start_s = float(raw_s[first])
+        forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
+        world_from_source = world_from_first(forward[first])
+        notes.append(origin_note(forward[first]))
+        path = EgoPath(seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
+        path = mended_path(path, options, notes)
+        raw_s = raw_s[[number - known[0] for number in frames]]
+        needed = dict.fromkeys((*cameras, "front_camera"))
+        camera_s, world_from_cam = {}, {}
+        for name in needed:
+            here = folder / "camera" / name
+            if name not in cameras and not (here / "poses.json").is_file():
+                continue
+            stamps = here / "timestamps.json"
+            times = _times(stamps, frames)
+            late = np.abs(times - raw_s)
+            if late.max() > MAX_CAMERA_DELAY_S:
+                raise InputError("camera and LiDAR do not share a clock",
+                    where=f"{stamps}: entry {frames[int(late.argmax())]}",
+                    expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json",
+                    got=f"{late.max():.3f} s apart", remedy="are the times in seconds, and of this sequence?")  # fmt: skip
+            stamped_s = seconds(times, "s", str(stamps), start_s)
+            camera_s[name] = stamped_s + EXPOSURE_S
+            given = world_from_source @ _poses(here / "poses.json", frames)
+            world_from_cam[name] = np.stack([
+                pose_on_path(path, time_s + POSE_S) @ invert(pose_on_path(path, time_s)) @ pose
+                for time_s, pose in zip(stamped_s, given, strict=True)
+            ])  # fmt: skip
+        places = _lidar_places(path, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
+        return cls(world_from_source, raw_s, start_s, camera_s, world_from_cam, path, places)
+
+    def world_from_lidar(self, d: int, time_s: float) -> Matrix:
+        """Pose of a LiDAR, f64[4, 4]."""
+        return pose_on_path(self.path, time_s) @ from_rotation_translation(np.eye(3), self.places[d])
+
+    def ego(self) -> EgoPath:
+        """The vehicle's path from its pose before the first image on; where there is none before, it starts with the image."""
+        first_s = min(float(times[0]) for times in self.camera_s.values())
+        times_s, poses = self.path.times_s, self.path.world_from_ego
+        if first_s < times_s[0] - 1e-3:
+            poses = np.concatenate([pose_on_path(self.path, first_s)[None], poses])
+            times_s = np.concatenate([[first_s], times_s])
+        return EgoPath(times_s, poses)
+
+
+def pose_on_path(path: EgoPath, time_s: float) -> Matrix:
+    """The vehicle's pose f64[4, 4]; beyond an end of the path it goes on as it did there."""
+    return pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
+
+
+def _lidar_places(
+    path: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
+) -> dict[int, Matrix]:
+    """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
+    camera = np.array(FRONT_CAMERA_M)
+    if times_s is not None and world_from_cam is not None:
+        where_s = times_s - EXPOSURE_S + POSE_S
+        seen = [
+            transform_points(invert(pose_on_path(path, time_s)), pose[None, :3, 3])[0]
+            for time_s, pose in zip(where_s, world_from_cam, strict=True)
+        ]
+        camera = np.median(seen, axis=0)
+    return {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
+
+
+def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
+    """The entries of a JSON list that belong to ``frames``."""
+    values = store.read_json(path)
+    if not isinstance(values, list) or len(values) <= frames[-1]:
+        got = f"{len(values)} entries" if isinstance(values, list) else type(values).__name__
+        raise InputError("list does not cover the frames", where=str(path), got=got,
+            expected=f"a list with an entry per frame, at least {frames[-1] + 1}",
+            remedy="is the file cut off, or of another sequence?")  # fmt: skip
+    return [values[n] for n in frames]
+
+
+def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
+    values = _entries(path, frames)
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        raise InputError("timestamps are not numbers", where=str(path), got=str(values)[:80])
+    times = np.array(values, np.float64)
+    seconds(times, "s", str(path))
+    if times[0] > 1e11:
+        raise InputError("timestamps are in another unit than expected", where=str(path),
+            expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy="divide them by 1000 or 1000000")  # fmt: skip
+    return times
+
+
+def _poses(path: Path, frames: Sequence[int]) -> Matrix:
+    poses = []
+    for number, entry in zip(frames, _entries(path, frames), strict=True):
+        where = f"{path}: entry {number}"
+        with record_fields("pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"):
+            heading = [entry["heading"][key] for key in "wxyz"]
+            poses.append(pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
+        note_unknown_within(_POSES, entry, _POSE_FIELDS)
+    return np.stack(poses)
+
+
+def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageFit:
+    path = folder / "intrinsics.json"
+    values = store.read_json(path)
+    with record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
+        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        note_unknown(path.name, values, OFFICIAL[path.name])
+    # the data set counts pixels from the centre of the top-left one, as OpenCV does
+    return fit_images(Camera(name, *image_size(image), fx, fy, cx + 0.5, cy + 0.5), options)
+
+
+# --- points -----------------------------------------------------------------------------------------------------------
+
+
+def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[Any]]:
+    frame = read_frame(path)
+    require_columns(names, frame, path)
+    note_unknown(kind, frame, OFFICIAL[kind])
+    return frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cloud:
+    """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of the scene's clock, the
+    middle of the turn), ``d`` 0 or 1. Beams without a return are left out: ``returns`` bool[M] says which rows of the file are none, and
+    ``without`` how many of them each LiDAR has."""
+
+    time_s: float
+    xyz: Matrix
+    intensity: NDArray[np.float64]
+    dt_s: NDArray[np.float64]
+    d: NDArray[np.float64]
+    returns: NDArray[np.bool_]
+    without: Mapping[int, int]
+
+    def of_sensor(self, d: int, lidar_from_source: Matrix, classes: NDArray[np.uint8] | None) -> SweepPoints:
+        """The points of LiDAR ``d`` in its frame."""
+        mine = self.d == d
+        xyz = transform_points(lidar_from_source, self.xyz[mine]).astype(np.float32)
+        intensity, dt_s = (values[mine].astype(np.float32) for values in (self.intensity, self.dt_s))
+        return SweepPoints(xyz, intensity, dt_s, None if classes is None else classes[mine], self.without[d])
+
+
+def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
+    frame_s = float(motion.raw_s[index])
+    frame = _columns(path, _POINT_COLUMNS, _POINTS)
+    returns = returns_of(frame, path)
+    without = {d: int((frame["d"][~returns] == d).sum()) for d in SENSORS}
+    frame = {name: values[returns] for name, values in frame.items()}
+    columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
+    late_s = columns["t"] - frame_s
+    if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
+        raise InputError("points do not belong to their frame's time", where=f"{path}: t",
+            expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
+            got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}",
+            remedy="is the file of another frame or sequence?")  # fmt: skip
+    if not np.isin(columns["d"], list(SENSORS)).all():
+        raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
+    turning = late_s[columns["d"] == 0]
+    middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
+    xyz = np.stack([columns[axis] for axis in "xyz"], 1)
+    intensity = (columns["i"] / 255).clip(0, 1)
+    return _Cloud(frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
+
+
+# --- boxes ------------------------------------------------------------------------------------------------------------
+
+
+def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
+    frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
+    centre = finite_columns(frame, ("position.x", "position.y", "position.z"), path)
+    sizes = finite_columns(frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path)  # length, width, height
+    yaw = finite_columns(frame, ("yaw",), path)[:, 0]
+    sensor = np.full(len(yaw), -1.0)
+    if "cuboids.sensor_id" in frame:
+        given = np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])
+        sensor = finite_columns({"cuboids.sensor_id": given}, ("cuboids.sensor_id",), path)[:, 0]
+    siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
+    when = _MeasuringTimes(cloud, motion)
+    rows = []
+    for row in range(len(yaw)):
+        box = yaw_matrix(yaw[row] + np.pi / 2, centre[row])
+        length, width, height = sizes[row].tolist()
+        size, uuid, label = (length, width, height), str(frame["uuid"][row]), str(frame["label"][row])
+        standing, of = bool(frame["stationary"][row]), int(sensor[row])
+        late_s = 0.0 if standing else when.delay_s(box, size, of)
+        sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
+        world_from_box = motion.world_from_source @ box
+        rows.append(_Cuboid(uuid, label, cloud.time_s, late_s, size, world_from_box, standing, of, sibling))
+    return rows
+
+
+def _missing(column: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a column has no value: None or NaN."""
+    return np.array([value is None or value != value for value in column], bool)
+
+
+class _MeasuringTimes:
+    """When the boxes of one frame were measured."""
+
+    def __init__(self, cloud: _Cloud, motion: _Motion) -> None:
+        self._cloud = cloud
+        self._source_from_lidar = invert(motion.world_from_source) @ motion.world_from_lidar(0, cloud.time_s)
+        self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
+
+    def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
+        """Seconds from the sweep's time: the median of the points inside; with few of them, of the points in that direction."""
+        xyz, dt_s, d = self._cloud.xyz, self._cloud.dt_s, self._cloud.d
+        centre, reach = source_from_box[:3, 3], float(np.linalg.norm(size_m)) / 2
+        near = np.flatnonzero((np.abs(xyz[:, :2] - centre[:2]) < reach).all(1) & (d == max(sensor, 0)))
+        inside = np.abs(transform_points(invert(source_from_box), xyz[near])) < np.array(size_m) / 2
+        near = near[inside.all(1)]
+        if len(near) < _MIN_BOX_POINTS:
+            near = self._towards(centre)
+        return float(np.median(dt_s[near])) if len(near) else 0.0
+
+    def _towards(self, centre: Matrix) -> NDArray[np.intp]:
+        """Points of the turning LiDAR within a degree of the direction to ``centre``."""
+        place = self._source_from_lidar[:3, 3]
+        if self._turning is None:
+            ids = np.flatnonzero(self._cloud.d == 0)
+            seen = self._cloud.xyz[ids, :2] - place[:2]
+            self._turning = ids, np.arctan2(seen[:, 1], seen[:, 0])
+        ids, azimuth = self._turning
+        turn = azimuth - np.arctan2(centre[1] - place[1], centre[0] - place[0])
+        return ids[np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(1.0)]
+
+
+def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> list[str]:
+    """Give the boxes to their tracks, siblings to one; returns notes."""
+    one_of: dict[str, str] = {}
+    for index in sorted(boxes):
+        for box in boxes[index]:
+            if box.sibling and box.sensor in (0, 1):
+                turning, solid = (box.uuid, box.sibling) if box.sensor == 0 else (box.sibling, box.uuid)
+                one_of.setdefault(solid, turning)
+    doubled = 0
+    for index in sorted(boxes):
+        kept: dict[str, _Cuboid] = {}
+        for box in sorted(boxes[index], key=lambda b: b.sensor == 1):
+            name = one_of.get(box.uuid, box.uuid)
+            doubled += name in kept
+            kept.setdefault(name, box)
+        for name, box in kept.items():
+            tracks.add(
+                name, tracks.label_of(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s
+            )
+    return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []

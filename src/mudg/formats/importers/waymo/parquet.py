@@ -1,0 +1,325 @@
+"""Waymo logs of format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log.
+
+Rows are read one at a time and in the order of the file, so that memory stays at one page of a column; the keys of all rows are
+read first and tell which row belongs to which frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.formats.importers.common import arrow_files, require_columns
+from mudg.formats.importers.waymo import records
+from mudg.formats.importers.waymo.records import CAMERAS, LASERS, FrameRecord, LaserScan
+from mudg.formats.unknown_fields import note_unknown
+
+_SEGMENT: Final = "key.segment_context_name"
+_TIME: Final = "key.frame_timestamp_micros"
+_CAMERA: Final = "key.camera_name"
+_LASER: Final = "key.laser_name"
+_OBJECT: Final = "key.laser_object_id"
+_INTRINSIC: Final = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+_VELOCITY: Final = tuple(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
+_EXPOSURE: Final = tuple(
+    f"rolling_shutter_params.{name}" for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
+)
+_BOX: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
+_STREAM_BYTES: Final = 1 << 20
+_TWO_RETURNS: Final = tuple(f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape"))
+OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
+    "camera_image": ("CameraImageComponent", ("image", "pose.transform", "pose_timestamp", *_VELOCITY, *_EXPOSURE)),
+    "camera_calibration": ("CameraCalibrationComponent", (
+        *(f"intrinsic.{name}" for name in _INTRINSIC), "extrinsic.transform", "width", "height", "rolling_shutter_direction",
+    )),
+    "camera_segmentation": ("CameraSegmentationLabelComponent", (
+        "panoptic_label", "panoptic_label_divisor", "sequence_id", "num_cameras_covered",
+        *(f"instance_id_to_global_id_mapping.{name}" for name in ("local_instance_ids", "global_instance_ids", "is_tracked")),
+    )),
+    "lidar": ("LiDARComponent", _TWO_RETURNS),
+    "lidar_box": ("LiDARBoxComponent", (
+        "type", *_BOX, *(f"{name}.{axis}" for name in ("speed", "acceleration") for axis in "xyz"), "num_lidar_points_in_box",
+        "num_top_lidar_points_in_box", "difficulty_level.detection", "difficulty_level.tracking",
+    )),
+    "lidar_calibration": ("LiDARCalibrationComponent", (
+        "extrinsic.transform", *(f"beam_inclination.{name}" for name in ("min", "max", "values")),
+    )),
+    "lidar_camera_projection": ("LiDARCameraProjectionComponent", _TWO_RETURNS),
+    "lidar_pose": ("LiDARPoseComponent", _TWO_RETURNS[:2]),
+    "stats": ("StatsComponent", (
+        "time_of_day", "location", "weather", *(f"{of}_object_counts.{part}" for of in ("lidar", "camera") for part in ("types", "counts")),
+    )),
+    "vehicle_pose": ("VehiclePoseComponent", ("world_from_vehicle.transform",)),
+}  # fmt: skip
+"""Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published components."""
+_KEYS: Final = (_SEGMENT, _TIME, _CAMERA, _LASER, _OBJECT, "index", "__index_level_0__")
+"""Columns that every table may have; the last two are the index of pandas."""
+
+REQUIRED: Final = ("camera_image", "camera_calibration", "vehicle_pose")
+"""Components without which there is no scene."""
+
+
+class ParquetLog:
+    """One log of a format-2 folder. Opening it reads all small tables and the keys of the large ones.
+
+    Args:
+        root: folder with the component folders.
+        segment: name of the log, that of its files.
+        wanted: frames (first, end) in the order of time, or None.
+
+    Raises:
+        InputError: a component is missing, or a table is damaged or contradictory.
+        ResourceError: pyarrow is not installed.
+    """
+
+    form = "v2 Parquet"
+
+    def __init__(self, root: Path, segment: str, wanted: tuple[int, int] | None = None) -> None:
+        self._root, self.name = root, segment
+        self.cameras: Mapping[str, records.CameraCalibration] = dict(_cameras(self._need("camera_calibration")))
+        self._images, self._vehicle = self._need("camera_image"), self._need("vehicle_pose")
+        self._lidar, self._poses = self._table("lidar"), self._table("lidar_pose")
+        self._labels, self._projections = self._table("camera_segmentation"), self._table("lidar_camera_projection")
+        calibration = self._table("lidar_calibration") if self._lidar is None else self._need("lidar_calibration")
+        self.lasers: Mapping[str, records.LaserCalibration] = {} if calibration is None else dict(_lasers(calibration))
+        if self._lidar is not None and self._poses is None:
+            raise InputError("the top LiDAR's pixel poses are missing", where=str(root),
+                expected=f"lidar_pose/{segment}.parquet",
+                remedy="download the component: without it the scans of a moving vehicle are twisted")  # fmt: skip
+        self.frames: Sequence[FrameRecord] = self._frames(wanted)
+        self.conditions = self._conditions()
+
+    def read(self, frame: FrameRecord, cameras: Sequence[str], *, projections: bool = False) -> records.FrameContent:
+        """The bulky parts of a frame; see ``WaymoLog``. Reading frames in the order of time is fastest."""
+        time = frame.timestamp_us
+        images = {
+            name: bytes(self._images.value(row, "[CameraImageComponent].image"))
+            for name, row in self._images.rows(time, _CAMERA, CAMERAS)
+            if name in cameras
+        }
+        panoptic: dict[str, records.Panoptic] = {}
+        for name, row in self._labels.rows(time, _CAMERA, CAMERAS) if self._labels is not None else ():
+            if name in cameras and self._labels is not None:
+                column = "[CameraSegmentationLabelComponent].panoptic_label"
+                png, divisor = self._labels.value(row, column), self._labels.value(row, f"{column}_divisor")
+                panoptic[name] = records.Panoptic(int(divisor), bytes(png))
+        scans: dict[str, LaserScan] = {}
+        if self._lidar is not None:
+            for name, row in self._lidar.rows(time, _LASER, LASERS):
+                if name in frame.lasers:
+                    scans[name] = self._scan(self._lidar, frame, name, row, projections)
+        return records.FrameContent(images, panoptic, scans)
+
+    def pixel_poses(self, frame: FrameRecord) -> NDArray[np.float32] | None:
+        """Poses of the top LiDAR's pixels f32[H, W, 6]; see ``WaymoLog``."""
+        if self._poses is not None:
+            for name, row in self._poses.rows(frame.timestamp_us, _LASER, LASERS):
+                if name == records.TOP:
+                    return self._poses.image(row, "[LiDARPoseComponent].range_image_return1", 6)
+        return None
+
+    def _scan(self, lidar: ParquetTable, frame: FrameRecord, name: str, row: int, projections: bool) -> LaserScan:
+        found = [lidar.image(row, f"[LiDARComponent].range_image_return{n}", 4) for n in (1, 2)]
+        returns = [image for image in found if image is not None]
+        poses = self.pixel_poses(frame) if name == records.TOP else None
+        if name == records.TOP and poses is None:
+            raise InputError("frame has no pixel poses", where=f"{frame.where}: lidar_pose",
+                expected="a row for the top LiDAR")  # fmt: skip
+        places: list[NDArray[np.int64]] = []
+        if projections and self._projections is not None:
+            for other, place in self._projections.rows(frame.timestamp_us, _LASER, LASERS):
+                if other == name:
+                    prefix = "[LiDARCameraProjectionComponent].range_image_return"
+                    images = (self._projections.image(place, f"{prefix}{n + 1}", 6) for n in range(len(returns)))
+                    places = [image.astype(np.int64) for image in images if image is not None]
+        return LaserScan(returns, poses, places if len(places) == len(returns) else ())
+
+    # --- facts ------------------------------------------------------------------------------------------------------
+
+    def _frames(self, wanted: tuple[int, int] | None) -> list[FrameRecord]:
+        where, column = str(self._vehicle.path), "[VehiclePoseComponent].world_from_vehicle.transform"
+        table = self._vehicle.columns((_SEGMENT, _TIME, column))
+        others = {str(name) for name in table[_SEGMENT]} - {self.name}
+        if others:
+            raise InputError("the file holds other logs", where=where, expected=self.name,
+                got=", ".join(sorted(others)[:4]))  # fmt: skip
+        poses = {int(time): pose for time, pose in zip(table[_TIME], table[column], strict=True)}
+        twice = len(table[_TIME]) - len(poses)
+        if twice:
+            raise InputError("the table has a frame twice", where=f"{where}: {_TIME}", got=f"{twice} times")
+        chosen = list(enumerate(sorted(poses)))[slice(*wanted) if wanted else slice(None)]
+        if not chosen:
+            raise InputError(
+                "no frames to import", where=where, got=f"{len(poses)} frames", expected=f"frames {wanted}"
+            )
+        shots, boxes = self._shots(), self._boxes()
+        frames = []
+        for number, time in chosen:
+            here = f"{self._root}: {self.name}, frame {number}"
+            lasers = [] if self._lidar is None else [name for name, _ in self._lidar.rows(time, _LASER, LASERS)]
+            pose, found = records.transform_of(poses[time], here), records.by_name(shots.get(time, ()), time, here)
+            names = records.each_once(lasers, here)
+            frames.append(FrameRecord(number, time, pose, found, names, tuple(boxes.get(time, ())), here))
+        return frames
+
+    def _shots(self) -> dict[int, list[tuple[str, records.CameraShot]]]:
+        shots: dict[int, list[tuple[str, records.CameraShot]]] = {}
+        names, optional = ("pose.transform", "pose_timestamp"), (*_EXPOSURE, *_VELOCITY)
+        for where, row in self._images.records("CameraImageComponent", (_TIME, _CAMERA), names, optional):
+            if row[_CAMERA] in CAMERAS:
+                speeds = [row[name] for name in _VELOCITY]
+                velocity = None if None in speeds else np.array(speeds, np.float64)
+                exposure = (float(row[name] or 0.0) for name in _EXPOSURE)
+                pose = records.transform_of(row["pose.transform"], where)
+                shot = records.CameraShot(pose, float(row["pose_timestamp"]), velocity, *exposure)
+                shots.setdefault(int(row[_TIME]), []).append((CAMERAS[row[_CAMERA]], shot))
+        return shots
+
+    def _boxes(self) -> dict[int, list[records.WaymoBox]]:
+        table, boxes = self._table("lidar_box"), {}
+        if table is not None:
+            for where, row in table.records("LiDARBoxComponent", (_TIME, _OBJECT), ("type", *_BOX)):
+                box = records.box_of(str(row[_OBJECT]), row["type"], [row[name] for name in _BOX], where)
+                boxes.setdefault(int(row[_TIME]), []).append(box)
+        return boxes
+
+    def _conditions(self) -> str:
+        table = self._table("stats")
+        if table is None:
+            return ""
+        names = tuple(f"[StatsComponent].{name}" for name in ("time_of_day", "weather", "location"))
+        found = table.columns((), optional=names)
+        return ", ".join(str(found[name][0]) for name in names if found[name] and found[name][0])
+
+    def _table(self, component: str) -> ParquetTable | None:
+        path = self._root / component / f"{self.name}.parquet"
+        if not path.is_file():
+            return None
+        table, (prefix, columns) = ParquetTable(path), OFFICIAL[component]
+        note_unknown(f"{component}/*.parquet", table.names, frozenset({*_KEYS, *(f"[{prefix}].{name}" for name in columns)}))
+        return table
+
+    def _need(self, component: str) -> ParquetTable:
+        table = self._table(component)
+        if table is None:
+            raise InputError("a component of the log is missing", where=str(self._root),
+                expected=f"{component}/{self.name}.parquet", remedy="download it beside the others")  # fmt: skip
+        return table
+
+
+def _cameras(table: ParquetTable) -> Iterator[tuple[str, records.CameraCalibration]]:
+    names, direction = [f"intrinsic.{name}" for name in _INTRINSIC], "rolling_shutter_direction"
+    required = (*names, "extrinsic.transform", "width", "height")
+    for where, row in table.records("CameraCalibrationComponent", (_CAMERA,), required, (direction,)):
+        if row[_CAMERA] in CAMERAS:
+            name, image = CAMERAS[row[_CAMERA]], (int(row["width"]), int(row["height"]), int(row[direction] or 0))
+            yield name, records.camera_of(name, [row[n] for n in names], row["extrinsic.transform"], image, where)
+
+
+def _lasers(table: ParquetTable) -> Iterator[tuple[str, records.LaserCalibration]]:
+    low, high, beams = (f"beam_inclination.{name}" for name in ("min", "max", "values"))
+    required = ("extrinsic.transform", low, high)
+    for where, row in table.records("LiDARCalibrationComponent", (_LASER,), required, (beams,)):
+        if row[_LASER] in LASERS:
+            name, limits = LASERS[row[_LASER]], (float(row[low]), float(row[high]))
+            yield name, records.laser_of(name, row[beams] or (), limits, row["extrinsic.transform"], where)
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+
+class ParquetTable:
+    """A Parquet file: whole columns of small values, or single large values row by row.
+
+    Raises:
+        InputError: not a Parquet file, damaged, or a column is missing.
+        ResourceError: pyarrow is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with arrow_files(path):
+            from pyarrow.parquet import ParquetFile
+
+            self._file = ParquetFile(store.regular(path), buffer_size=_STREAM_BYTES, pre_buffer=False, page_checksum_verification=True)
+        self.names: tuple[str, ...] = tuple(self._file.schema_arrow.names)
+        counts = [self._file.metadata.row_group(n).num_rows for n in range(self._file.num_row_groups)]
+        self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+        self._by_time: dict[str, dict[int, list[tuple[str, int]]]] = {}
+        self._streams: dict[tuple[str, ...], tuple[int, Iterator[Any]]] = {}
+
+    def records(
+        self, component: str, keys: Sequence[str], names: Sequence[str], optional: Sequence[str] = ()
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Place and plain values of every row: ``keys``, and columns of the component under their short ``names``."""
+        full = {name: f"[{component}].{name}" for name in (*names, *optional)}
+        table = self.columns((*keys, *(full[name] for name in names)), [full[name] for name in optional])
+        columns = {**{key: table[key] for key in keys}, **{name: table[column] for name, column in full.items()}}
+        for index, row in enumerate(zip(*columns.values(), strict=True)):
+            yield f"{self.path}: row {index}", dict(zip(columns, row, strict=True))
+
+    def columns(self, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, list[Any]]:
+        """Whole columns as lists of plain values; None may stand in the ``optional`` ones only."""
+        require_columns((*names, *optional), self.names, self.path)
+        with arrow_files(self.path):
+            found = self._file.read(columns=[*names, *optional])
+            empty = [name for name in names if found.column(name).null_count]
+            values = {name: found.column(name).to_pylist() for name in (*names, *optional)}
+        if empty:
+            row = values[empty[0]].index(None)
+            raise InputError("table has an empty value", where=f"{self.path}: row {row}", got=", ".join(empty))
+        return values
+
+    def rows(self, timestamp_us: int, sensor: str, names: Mapping[int, str]) -> list[tuple[str, int]]:
+        """Sensor names and rows of one frame, in the order of the file."""
+        if sensor not in self._by_time:
+            keys = self.columns((_TIME, sensor))
+            by_time: dict[int, list[tuple[str, int]]] = {}
+            for row, (time, number) in enumerate(zip(keys[_TIME], keys[sensor], strict=True)):
+                if number in names:
+                    by_time.setdefault(int(time), []).append((names[number], row))
+            self._by_time[sensor] = by_time
+        return self._by_time[sensor].get(timestamp_us, [])
+
+    def value(self, row: int, column: str) -> Any:
+        """One value as a plain one (bytes, number, list)."""
+        value = self._row(row, (column,)).column(0)[0].as_py()
+        if value is None:
+            raise InputError("table has an empty value", where=f"{self.path}: row {row}", got=column)
+        return value
+
+    def image(self, row: int, prefix: str, channels: int) -> NDArray[np.float32] | None:
+        """A range image [H, W, channels] kept as values and shape; None where it is not recorded."""
+        found = self._row(row, (f"{prefix}.values", f"{prefix}.shape"))
+        values, shape = found.column(0)[0], found.column(1)[0]
+        if not values.is_valid or not shape.is_valid or len(values) == 0:
+            return None
+        data = values.values.to_numpy(zero_copy_only=False)
+        return records.shaped(data, shape.as_py(), channels, f"{self.path}: row {row}, {prefix}")
+
+    def _row(self, row: int, names: tuple[str, ...]) -> Any:
+        """One row of some columns. Going forward goes on where the last call stopped; going back starts a row group anew."""
+        require_columns(names, self.names, self.path)
+        next_row, stream = self._streams.get(names, (-1, iter(())))
+        group = int(np.searchsorted(self._starts, row, side="right")) - 1
+        with arrow_files(self.path):
+            if next_row > row or next_row < self._starts[group]:
+                groups = list(range(group, self._file.num_row_groups))
+                stream = self._file.iter_batches(
+                    batch_size=1, row_groups=groups, columns=list(names), use_threads=False
+                )
+                next_row = int(self._starts[group])
+            batch = None
+            while next_row <= row:
+                batch = next(stream)
+                next_row += 1
+        self._streams[names] = (next_row, stream)
+        if batch is None or batch.num_rows != 1:
+            raise InputError("table has fewer rows than it declares", where=f"{self.path}: row {row}")
+        return batch.select(list(names))

@@ -1,0 +1,220 @@
+"""``mudg ingest``: a dataset log, or the built-in procedural city -> a scene directory."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mudg.base import log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import RunDir, run_state
+from mudg.base.types import Scene
+from mudg.formats.importers import IMPORTERS, RECOGNISERS, files_of
+from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution, processors
+from mudg.formats.settings import IngestConfig
+from mudg.scene import check as alignment
+from mudg.scene import check as scene_check
+from mudg.scene import contact_sheet
+from mudg.scene.read import read_scene
+from mudg.scene.write import SceneWriter
+
+CITY = "city"
+
+
+def files_read(config: IngestConfig, source: Path, kind: str) -> dict[str, Path]:
+    """Files of the log that an import of this kind reads, by names for messages."""
+    if kind not in IMPORTERS:
+        return {}
+    files = files_of(kind, source, import_options(config))
+    return {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))}
+
+
+def is_abandoned(out: Path) -> bool:
+    """Whether an import that is not finished made no scene at ``out`` yet."""
+    state = run_state(out)
+    return state.get("verb") == "ingest" and state["state"] != "complete" and not (out / "scene.json").is_file()
+
+
+def write_scene(config: IngestConfig, source: Path, kind: str, work: RunDir) -> dict[str, Any]:
+    """Make the scene in its folder and draw its contact sheet; returns a summary. An import that fails in a new or empty folder leaves
+    nothing.
+
+    Raises:
+        InputError: the log is malformed or contradictory.
+    """
+    try:
+        return _fill(work, kind, config, source)
+    except BaseException:
+        if work.fresh and not (work.path / "scene.json").is_file():
+            work.discard()  # nothing was made: the next try may ask for something else
+        raise
+
+
+def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict[str, Any]:
+    if (folder.path / "scene.json").is_file():
+        scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
+    else:
+        scene = _make(kind, config, source, folder.path)
+        if kind not in (CITY, _SCENE):
+            warnings = [finding for finding in scene_check.check_records(scene) if finding.level == "warning"]
+            for line in scene_check.folded(warnings, f"mudg doctor {folder.out}"):
+                log.warn(f"ingest: {line}")
+    held_out = sum(split == "test" for split in scene.split.values())
+    log.info(
+        f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
+        f"tracked boxes; {held_out} images held out"
+    )
+    summary = {
+        "frames": len(scene.frames),
+        "sweeps": len(scene.sweeps),
+        "tracks": len(scene.tracks),
+        "held_out": held_out,
+    }
+    if config.contact_sheet:
+        sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
+        log.info(f"ingest: check {folder.out / sheet.name}")
+    return {**summary, **({} if kind == CITY else _alignment(scene))}
+
+
+def _alignment(scene: Scene) -> dict[str, Any]:
+    """How the images fit the LiDAR, for the summary; a warning for a doubtful camera."""
+    found = alignment.camera_alignment(scene)
+    for name, one in found.items():
+        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.describe(name, one)}")
+    return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
+
+
+_SCENE = "scene"
+
+
+def kind_of(config: IngestConfig, source: Path) -> str:
+    """Which format ``source`` has: one of a log, ``city`` or ``scene``.
+
+    Raises:
+        UsageError: there is no such format. InputError: there is no log, or of no format that is known.
+    """
+    if str(source) == CITY:
+        return CITY
+    if config.format not in ("auto", *IMPORTERS):
+        raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
+            got=config.format)  # fmt: skip
+    if not source.exists():
+        raise InputError("driving log does not exist", where=str(source),
+            expected=f"a folder, a scene zip, or the word {CITY}")  # fmt: skip
+    if config.format != "auto":
+        return config.format
+    if is_scene(source):
+        return _SCENE
+    for name, looks_like in RECOGNISERS.items():
+        if looks_like(source):
+            log.info(f"ingest: {source} recognised as {name}")
+            return name
+    inside = "a file"
+    if source.is_dir():
+        inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
+    raise InputError("the log's format was not recognised", where=str(source),
+        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}", got=inside,
+        remedy="give the folder of one drive or sequence, or name the format with --format")  # fmt: skip
+
+
+def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
+    """Make the scene at ``out``."""
+    if kind == CITY:
+        return _city(config, out)
+    if kind == _SCENE:
+        return _copy_scene(config, source, out)
+    return IMPORTERS[kind](source, out, import_options(config))
+
+
+def is_scene(source: Path) -> bool:
+    """Whether ``source`` is a scene directory, or a zip, which can be nothing else."""
+    return (source.is_file() and source.suffix == ".zip") or (source / "scene.json").is_file()
+
+
+def import_options(config: IngestConfig) -> ImportOptions:
+    """The importer's options that a configuration asks for."""
+    return ImportOptions(
+        frames=parse_frame_range(config.frames),
+        cameras=config.cameras,
+        sequence=config.sequence,
+        poses=Path(config.poses) if config.poses else None,
+        boxes=Path(config.boxes) if config.boxes else None,
+        skip_missing=config.skip_missing,
+        bridge_gaps=config.bridge_gaps,
+        untwist=config.untwist,
+        test_every=config.test_every,
+        resolution=parse_resolution(config.resolution),
+        workers=config.workers or processors(),
+    )
+
+
+def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
+    """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to the chosen
+    one; a scene's own digest.
+
+    Args:
+        kind: format, or ``scene``.
+        config: chooses the log, where a folder holds many; files it names count, too.
+
+    Raises:
+        UsageError: several logs and none was chosen. InputError: none is there.
+    """
+    if kind == _SCENE:
+        return store.digest(source)
+    options = import_options(config)
+    files = files_of(kind, source, options)
+    named = [path for path in (options.poses, options.boxes) if path is not None and path.exists()]
+    total = hashlib.sha256()
+    base = source if source.is_dir() else source.parent
+    for path in (*files.files, *named):
+        for name in _walk(path):
+            state = name.stat() if name.exists() else name.lstat()  # a link may lead nowhere
+            place = Path(os.path.relpath(name, base)).as_posix()
+            total.update(f"{place}\0{state.st_size}\0{state.st_mtime_ns}\n".encode())
+    for path in files.entries:
+        total.update(f"{path.name}\0{path.stat().st_mtime_ns}\n".encode())
+    return total.hexdigest()
+
+
+def _walk(path: Path) -> Iterator[Path]:
+    """A file, or all files below a folder in the order of their names."""
+    if path.is_file():
+        yield path
+    for folder, names, files in os.walk(path):
+        names.sort()
+        yield from (Path(folder) / name for name in sorted(files))
+
+
+def _city(config: IngestConfig, out: Path) -> Scene:
+    from mudg.city.logs import write_city
+
+    _refuse(
+        config,
+        _OF_A_LOG,
+        "the generated city has settings of its own",
+        "use --city.n-frames, --city.cameras, --city.width, ...",
+    )
+    return write_city(config.city, out, test_every=config.test_every)
+
+
+_OF_A_LOG = ("frames", "cameras", "sequence", "poses", "boxes", "resolution")
+
+
+def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) -> None:
+    given = [f"--{name}" for name in names if getattr(config, name)]
+    if given:
+        raise UsageError(what, where=", ".join(given), remedy=remedy)
+
+
+def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
+    """Copy a scene, every file checked; held-out frames are kept as the scene has them."""
+    _refuse(config, _OF_A_LOG, "this setting does not apply to a scene, which is copied unchanged", "leave it out")
+    scene = read_scene(source)
+    with SceneWriter(out, scene.id, scene.source) as writer:
+        writer.copy_all_but_frames(scene)
+        for frame in log.progress(scene.frames, len(scene.frames), "copying frames"):
+            writer.copy_frame(scene, frame)
+        return writer.finish()

@@ -1,0 +1,230 @@
+"""Reading and writing bytes that nobody vouches for: parts within bounds, inflating within bounds, zips without surprises."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.errors import InputError
+from mudg.formats.splats.cloud import MAX_GAUSSIANS, Floats
+
+MAX_BYTES: Final = 8 << 30
+"""No file, and nothing that a file inflates to, may be larger."""
+
+
+def part(content: bytes, start: int, size: int, what: str, where: str) -> memoryview:
+    """``size`` bytes from ``start``; InputError if the content ends before."""
+    if start < 0 or size < 0 or start + size > len(content):
+        raise InputError(f"the file ends within {what}", where=where, expected=f"{start + size} bytes", got=f"{len(content)} bytes",
+            remedy="it was cut off, or its header is damaged: get the file again")  # fmt: skip
+    return memoryview(content)[start : start + size]
+
+
+def numbers(content: bytes, start: int, kind: str, count: int, what: str, where: str) -> NDArray[Any]:
+    """``count`` numbers of a numpy type such as ``<f4``, as a view; InputError if the content ends before."""
+    dtype = np.dtype(kind)
+    return np.frombuffer(part(content, start, count * dtype.itemsize, what, where), dtype)
+
+
+def unpacked(layout: str, content: bytes, start: int, what: str, where: str) -> tuple[Any, ...]:
+    """``struct.unpack`` within bounds."""
+    return struct.unpack(layout, part(content, start, struct.calcsize(layout), what, where))
+
+
+def refuse_count(count: int, where: str) -> None:
+    """InputError for a number of Gaussians that no file holds."""
+    if not 0 < count <= MAX_GAUSSIANS:
+        raise InputError("the number of Gaussians in the header is not possible", where=where, expected=f"1 to {MAX_GAUSSIANS}",
+            got=str(count))  # fmt: skip
+
+
+def refuse_bomb(count: int, content: bytes, where: str) -> None:
+    """InputError for more Gaussians than a compressed file of this size holds: at most 20 a byte, hundreds of times what is usual."""
+    if count > 20 * len(content) + 65536:
+        raise InputError("the header names more Gaussians than a file of this size can hold", where=where,
+            expected=f"at most {20 * len(content) + 65536}", got=str(count))  # fmt: skip
+
+
+# -- compressed streams --------------------------------------------------------------------------------------------------
+
+
+def gzip_bytes(content: bytes) -> bytes:
+    """One gzip member without a name or a time: the same bytes for the same content."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+    return packer.compress(content) + packer.flush()
+
+
+class GzipStream:
+    """The content of a gzip file, inflated as far as it is asked for and no further."""
+
+    def __init__(self, content: bytes, where: str) -> None:
+        self._rest, self._where = content, where
+        self._inflater = zlib.decompressobj(31)
+
+    def read(self, size: int, what: str) -> bytes:
+        """The next ``size`` bytes; InputError if there are fewer or they are damaged."""
+        found = bytearray()
+        try:
+            while len(found) < size:
+                more = self._inflater.decompress(self._rest, min(size - len(found), 1 << 24))
+                self._rest = self._inflater.unconsumed_tail
+                if not more and (self._inflater.eof or not self._rest):
+                    break
+                found += more
+        except zlib.error as error:
+            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        if len(found) < size:
+            raise InputError(f"the file ends within {what}", where=self._where, expected=f"{size} bytes", got=f"{len(found)} bytes",
+                remedy="it was cut off, or its header is damaged: get the file again")  # fmt: skip
+        return bytes(found)
+
+    def rest(self, most: int) -> bytes:
+        """What is left, up to ``most`` bytes."""
+        found = bytearray()
+        try:
+            while len(found) < most and (more := self._inflater.decompress(self._rest, most - len(found))):
+                self._rest = self._inflater.unconsumed_tail
+                found += more
+        except zlib.error as error:
+            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        return bytes(found)
+
+    def close(self) -> None:
+        """InputError unless the content ends here, with the right checksum."""
+        try:
+            more = self._inflater.decompress(self._rest, 1)
+        except zlib.error as error:
+            raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
+        if more or not self._inflater.eof:
+            what = "goes on after its last value" if more else "ends before its checksum"
+            raise InputError(
+                f"the compressed content {what}", where=self._where, remedy="the header does not fit the content"
+            )
+
+
+# -- zips ----------------------------------------------------------------------------------------------------------------
+
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+
+
+def stored_zip(files: Mapping[str, bytes], align: int = 1) -> bytes:
+    """A zip without compression, in the order given; the content of every file begins at a multiple of ``align`` bytes.
+
+    The same bytes for the same files.
+    """
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=align == 1) as archive:
+        for name, content in files.items():
+            info = zipfile.ZipInfo(name, _EPOCH)
+            info.external_attr = 0o644 << 16
+            begins = target.tell() + 30 + len(name.encode())
+            gap = -begins % align
+            if gap:
+                gap += align if gap < 4 else 0  # an extra field takes at least 4 bytes
+                info.extra = struct.pack("<HH", 0x1986, gap - 4) + bytes(gap - 4)
+            archive.writestr(info, content)
+    return target.getvalue()
+
+
+class BoundedZip:
+    """Files of a zip by name, each no larger than asked for; nothing is unpacked to the disk."""
+
+    def __init__(self, content: bytes, where: str) -> None:
+        self._where = where
+        try:
+            self._archive = zipfile.ZipFile(io.BytesIO(content))
+            infos = self._archive.infolist()
+        except (zipfile.BadZipFile, ValueError, EOFError, struct.error, NotImplementedError, OSError) as error:
+            raise InputError("not a readable zip file", where=where, got=str(error)) from error
+        if len(infos) > 100_000:
+            raise InputError(
+                "the zip lists too many files", where=where, expected="at most 100000", got=str(len(infos))
+            )
+        self._infos = {info.filename: info for info in infos}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its files."""
+        return tuple(self._infos)
+
+    def read(self, name: str, most: int) -> bytes:
+        """The content of a file; InputError if there is none, it is damaged, or larger than ``most`` bytes."""
+        where = f"{self._where}: {name}"
+        info = self._infos.get(name)
+        if info is None:
+            raise InputError("a file is missing in the zip", where=where, got=", ".join(sorted(self._infos)[:8]))
+        if info.file_size > most:
+            raise InputError(
+                "a file in the zip is too large", where=where, expected=f"at most {most} bytes", got=f"{info.file_size}"
+            )
+        try:
+            with self._archive.open(info) as handle:
+                content = handle.read(most + 1)
+                rest = b"" if len(content) <= most else content[most:]
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            ValueError,
+            NotImplementedError,
+            RuntimeError,
+            OSError,
+            struct.error,
+        ) as error:
+            raise InputError("a file in the zip is damaged", where=where, got=str(error)) from error
+        if rest or len(content) != info.file_size:
+            raise InputError("a file in the zip has another size than listed", where=where, expected=str(info.file_size),
+                got=str(len(content)))  # fmt: skip
+        return content
+
+
+# -- order and packing ---------------------------------------------------------------------------------------------------
+
+
+def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Rows ordered along a curve that keeps neighbours together (Morton, 21 bits an axis); stable."""
+    if len(means) == 0:
+        return np.zeros(0, np.intp)
+    low = means.min(0).astype(np.float64)
+    span = np.maximum(means.max(0).astype(np.float64) - low, 1e-9)
+    cells = ((means.astype(np.float64) - low) / span * ((1 << 21) - 1)).astype(np.uint64)
+    key = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        key |= _spread(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(key, kind="stable")
+
+
+def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Two zero bits after every bit of 21."""
+    v = bits
+    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+                        (2, 0x1249249249249249)):  # fmt: skip
+        v = (v | (v << np.uint64(shift))) & np.uint64(mask)
+    return v
+
+
+def smallest_three(quats: Floats) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Index of the largest of four components, i[n], and the other three in order, f64[n, 3], signed so that the largest is positive."""
+    q = quats.astype(np.float64)
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
+    largest = np.abs(q).argmax(1)
+    rows = np.arange(len(q))
+    q *= np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
+    others = np.arange(4)[None] != largest[:, None]
+    return largest, q[others].reshape(-1, 3)
+
+
+def from_smallest_three(largest: NDArray[np.integer], three: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of ``smallest_three``: four components, f64[n, 4]."""
+    made = np.empty((len(three), 4))
+    others = np.arange(4)[None] != np.asarray(largest)[:, None]
+    made[others] = three.reshape(-1)
+    made[~others] = np.sqrt(np.maximum(1 - (three**2).sum(1), 0))
+    return made

@@ -1,0 +1,207 @@
+"""The table of formats: what each is called, which axes its readers expect, what it carries, who writes and reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, log
+from mudg.base.errors import InputError
+from mudg.base.types import Scene
+from mudg.core.edit import HeightMap
+from mudg.formats.splats import alpasim, bundle, compressed_ply, gltf, ply, sog, splat, spz, usd
+from mudg.formats.splats import cloud as axes
+from mudg.formats.splats import gltf as gltf_read
+from mudg.formats.splats.cloud import SplatCloud, SplatFile, SplatNode, SplatScene, doubtful_values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WriteRequest:
+    """What is to be written.
+
+    Args:
+        scene: with the axes of the file. time_s: the moment, or None = all of the motion. spz_version: 3 or 4. log: whose cameras are
+            listed, where a format can. ground: where a format needs it.
+    """
+
+    scene: SplatScene
+    time_s: float | None
+    spz_version: int = 3
+    log: Scene | None = None
+    ground: HeightMap | None = None
+
+    @property
+    def cloud(self) -> SplatCloud:
+        """All Gaussians at the moment."""
+        return self.scene.at(0.0 if self.time_s is None else self.time_s)
+
+    @property
+    def drawing(self) -> Mapping[str, object]:
+        """How the fit draws Gaussians, where that is not the usual way."""
+        return self.scene.facts.get("drawing", {})
+
+    @property
+    def antialias(self) -> bool:
+        """Whether the fit draws antialiased."""
+        return bool(self.drawing.get("antialias", False))
+
+    @property
+    def marks(self) -> list[str]:
+        """Comments of a PLY file."""
+        return ply.marks_of(self.antialias, z_up=np.array_equal(self.scene.file_from_world, np.eye(4)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplatFormat:
+    """One format.
+
+    Args:
+        suffixes: of its files, the usual one first. axes: of ``cloud.py``, what its readers expect. write: bytes of a request, or None:
+            written elsewhere. read: Gaussians of bytes, or None: not read.
+        carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``.
+    """
+
+    suffixes: tuple[str, ...]
+    axes: str
+    write: Callable[[WriteRequest], bytes]
+    read: Callable[[bytes, str], SplatFile] | None = None
+    carries: frozenset[str] = field(default_factory=lambda: frozenset({"harmonics"}))
+
+
+FORMATS: Final[Mapping[str, SplatFormat]] = {
+    "ply": SplatFormat((".ply",), "RDF", lambda r: ply.to_bytes(r.cloud, classes=True, marks=r.marks),
+                       ply.from_bytes, frozenset({"harmonics", "classes", "antialias"})),
+    "bundle": SplatFormat((".zip",), axes.WORLD, lambda r: bundle.to_bytes(r.scene, r.log), None,
+                          frozenset({"harmonics", "motion", "deformation", "classes", "sky", "antialias"})),
+    "spz": SplatFormat((".spz",), "RUB", lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
+                       spz.from_bytes, frozenset({"harmonics", "antialias"})),
+    "glb": SplatFormat((".glb",), "FUR", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf_read.from_bytes,
+                       frozenset({"harmonics", "motion", "antialias"})),
+    "usda": SplatFormat((".usda", ".usd"), axes.WORLD, lambda r: usd.to_text(r.scene, r.time_s, log=r.log), None,
+                        frozenset({"harmonics", "motion", "deformation", "classes"})),
+    "usdz": SplatFormat((".usdz",), axes.WORLD, lambda r: usd.to_package(r.scene, r.time_s, r.log), None,
+                        frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
+    "alpasim": SplatFormat((".usdz",), axes.WORLD, lambda r: alpasim.to_package(r.scene, r.log, r.ground), None,
+                           frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
+    "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "RDF", lambda r: compressed_ply.to_bytes(r.cloud, r.marks),
+                                  compressed_ply.from_bytes, frozenset({"harmonics", "antialias"})),
+    "sog": SplatFormat((".sog",), "RDF", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
+                       frozenset({"harmonics", "antialias"})),
+    "splat": SplatFormat((".splat",), "RDF", lambda r: splat.to_bytes(r.cloud), splat.from_bytes, frozenset()),
+}  # fmt: skip
+
+
+COARSE_M: Final = 1e-3
+"""Steps between places beyond this are worth a word."""
+_OF_TRAINING: Final = "export PLY from the program that trained the Gaussians"
+_UNREAD: Final[Mapping[str, str]] = {
+    ".ksplat": "convert it, for example with splat-transform in.ksplat out.ply", ".lcc": "convert it, for example with splat-transform",
+    ".json": "give the .sog file that holds meta.json and its pictures (splat-transform meta.json out.sog)",
+    ".gltf": "pack it with its buffers into a .glb file",
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "export it again as ply, spz or glb"),
+    ".ckpt": _OF_TRAINING, ".pt": _OF_TRAINING, ".pth": _OF_TRAINING, ".npz": _OF_TRAINING,
+}  # fmt: skip
+"""What to do with files of Gaussians, or that come with them, that are not read."""
+
+
+def file_from_world(name: str, choice: str) -> NDArray[np.float64]:
+    """From the axes of this program to those of a format (``viewer``), f64[4, 4]; ``world``: no change."""
+    turn = axes.world_from_axes(axes.WORLD if choice == "world" else FORMATS[name].axes).T
+    return geometry.from_rotation_translation(turn, (0.0, 0.0, 0.0))
+
+
+def format_of(content: bytes, name: str) -> str:
+    """Which format a file is, by its first bytes, or by its name where it has no mark.
+
+    Raises:
+        InputError: none that is read.
+    """
+    suffix = PurePath(name).suffix.lower()
+    if content[:3] == b"ply":
+        return "compressed-ply" if compressed_ply.is_compressed(content) else "ply"
+    for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"glTF", "glb"), (b"PK\x03\x04", "sog")):
+        if content.startswith(mark):
+            if suffix == ".usdz":
+                break
+            return found
+    if suffix == ".splat":
+        return "splat"
+    known = ", ".join(sorted({suffix for format_ in FORMATS.values() if format_.read for suffix in format_.suffixes}))
+    raise InputError(
+        "this is no file of Gaussians that can be read",
+        where=name,
+        expected=known,
+        got=f"it begins with {content[:8]!r}",
+        remedy=_UNREAD.get(suffix, ""),
+    )
+
+
+def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCloud, str]:
+    """The Gaussians of a file in the axes of this program (z up), and the name of its format; ``means`` f64: take an origin near them away
+    before they become f32. Says on stderr what the file holds that was passed over or taken with doubt.
+
+    Args:
+        name: of the file, for messages and for formats without a mark. choice: of axes. ``file``: what the file says, else those that
+            viewers of its format expect; ``viewer``: these; ``world``: those of this program; or letters of ``cloud.py``.
+
+    Raises:
+        InputError: another or a damaged file. ResourceError: a package that this file needs is not installed.
+    """
+    found = format_of(content, name)
+    read = FORMATS[found].read
+    if read is None:  # no mark leads here
+        raise InputError("files of this format are not read", where=name, got=found)
+    with np.errstate(over="ignore", invalid="ignore"):  # readers check what comes of numbers that overflow or are none
+        file = read(content, name)
+        doubts = doubtful_values(file.cloud, name)
+    usual = {"viewer": FORMATS[found].axes, "world": axes.WORLD, "file": file.axes or FORMATS[found].axes}
+    chosen = usual.get(choice, choice)
+    for note in file.notes:
+        log.info(f"{name}: {note}")
+    for warning in (*file.warnings, *doubts):
+        log.warn(f"{name}: {warning}")
+    if file.axes and file.axes != chosen:
+        log.warn(f"{name}: {file.axes_by} says {axes.in_words(file.axes)}; --axes {choice} reads it as {axes.in_words(chosen)}")
+    elif choice == "file" and file.axes and file.axes != FORMATS[found].axes:
+        log.info(f"{name}: read as {axes.in_words(chosen)}, as {file.axes_by} says; --axes viewer reads it as viewers of its format do")
+    if file.step_m > COARSE_M:
+        log.warn(f"{name}: its places are stored in steps of {file.step_m * 1000:.3g} mm: take an offset away before the file is written")
+    return in_world(file.cloud, chosen), found
+
+
+def in_world(cloud: SplatCloud, letters: str) -> SplatCloud:
+    """A cloud from other axes in those of this program."""
+    turn = axes.world_from_axes(letters)
+    if np.linalg.det(turn) < 0:
+        cloud, turn = cloud.mirrored(), turn @ np.diag([1.0, -1.0, 1.0])
+    return cloud.moved(geometry.from_rotation_translation(turn, (0.0, 0.0, 0.0)))
+
+
+def losses(name: str, request: WriteRequest) -> list[str]:
+    """What of a scene its file does not hold, one sentence each."""
+    carries, scene = FORMATS[name].carries, request.scene
+    moving = [node for node in scene.nodes if node.moves]
+    bent = [node for node in moving if node.displacement is not None]
+    found = []
+    if moving and request.time_s is not None:
+        found.append(f"motion ({_objects(moving)} as at {request.time_s:g} s)")
+    elif bent and "deformation" not in carries:
+        found.append(f"deformation ({_objects(bent)} in the shape of the middle of the track)")
+    if "classes" not in carries and any(node.cloud.class_ids is not None for node in scene.nodes):
+        found.append("classes of the Gaussians")
+    if "sky" not in carries and scene.sky is not None:
+        found.append("the sky (--sky sphere adds it as Gaussians)")
+    if "harmonics" not in carries and scene.degree > 0:
+        found.append("colours that depend on the direction of view")
+    if kept := {key: value for key, value in request.drawing.items() if key not in carries}:
+        found.append("how the fit draws Gaussians (" + ", ".join(f"{key} {value}" for key, value in kept.items()) + ")")
+    return found
+
+
+def _objects(nodes: list[SplatNode]) -> str:
+    return nodes[0].name if len(nodes) == 1 else f"{len(nodes)} objects"

@@ -1,0 +1,360 @@
+"""The PLY of Gaussian splatting (Kerbl et al. 2023), which every viewer reads.
+
+    ply / format binary_little_endian 1.0 / element vertex N / property float x ... / end_header, then rows of f32:
+    x y z  nx ny nz (zero)  f_dc_0..2  f_rest_0..(3 (K - 1) - 1)  opacity (logit)  scale_0..2 (natural logarithm)  rot_0..3 (w x y z)
+
+``f_rest`` holds all red coefficients, then green, then blue. Columns of our own stand last (``class``: train id, 255 = unknown).
+
+Read besides: files without ``scale_2`` (2DGS: flat), ``filter_3D`` (Mip-Splatting: the least size that the recording resolved, which
+belongs to size and opacity), elements and lists of others, and what comments say of drawing and axes:
+
+    comment SplatRenderMode: mip      (Brush, gsplat; also written here)      comment antialiased 1 (Postshot)
+    comment Vertical Axis: z          (nerfstudio; also written here, where a file has the axes of this program)
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base.errors import InputError
+from mudg.formats.splats import binary
+from mudg.formats.splats.cloud import VERTICAL, SplatCloud, SplatFile, checked, known, logit, spacing_m
+from mudg.formats.unknown_fields import listed, sentence
+
+MAX_HEADER: Final = 1 << 16
+MOST_LISTS: Final = 2_000_000
+"""Rows of lists that are walked over to reach Gaussians behind them: seconds."""
+FLAT_LOG: Final = float(np.log(1e-6))
+"""Thickness of flat Gaussians, whose files state none."""
+_MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
+_MOTION: Final = ("trbf", "motion", "omega", "t_", "time", "scale_t", "scaling_t", "rot_r", "rotation_r", "velocity", "duration")
+"""Beginnings of columns with which methods for moving scenes move their Gaussians."""
+_UNREAD: Final = ("nx", "ny", "nz", "red", "green", "blue", "alpha")
+_ELEMENTS: Final = (
+    "face", "edge", "tristrips", "material", "camera", "extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space",
+    "version",
+)  # fmt: skip
+"""Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed list."""
+_TYPES: Final = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_LENGTHS: Final = {name for name, kind in _TYPES.items() if kind[0] != "f"}
+_REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
+"""Number of ``f_rest`` columns: degree."""
+
+
+def to_bytes(cloud: SplatCloud, *, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
+    """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
+    with_classes = classes and cloud.class_ids is not None
+    columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh), cloud.logits[:, None],
+               cloud.log_scales, cloud.quats]  # fmt: skip
+    if with_classes and cloud.class_ids is not None:
+        columns.append(cloud.class_ids[:, None])
+    rows = np.concatenate([column.astype("<f4") for column in columns], 1)
+    names = [*_names(cloud.degree), *(["class"] if with_classes else [])]
+    return header([("vertex", len(cloud), [("float", name) for name in names])], marks) + rows.tobytes()
+
+
+def from_bytes(content: bytes, where: str) -> SplatFile:
+    """The Gaussians of a PLY file; columns and elements that it does not know are passed over.
+
+    Raises:
+        InputError: another kind of PLY, or a damaged one.
+    """
+    file = read_elements(content, where, ("vertex",))
+    table = file.tables.get("vertex")
+    if table is None:
+        raise InputError("the PLY file has no vertices", where=where)
+    names = table.dtype.names or ()
+    flat = "scale_2" not in names and "scale_1" in names
+    sizes = _indexed("scale", 2 if flat else 3)
+    wanted = ("x", "y", "z", *_indexed("f_dc", 3), "opacity", *sizes, *_indexed("rot", 4))
+    _refuse_columns(table, wanted, where)
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in _REST or any(name not in names for name in _indexed("f_rest", rest)):
+        raise InputError(
+            "the number of f_rest columns fits no degree of harmonics",
+            where=where,
+            expected=", ".join(map(str, _REST)),
+            got=str(rest),
+        )
+    sh = np.concatenate(
+        [
+            columns_of(table, _indexed("f_dc", 3))[:, None],
+            coefficient_major(columns_of(table, _indexed("f_rest", rest)))[:, :15],
+        ],
+        1,
+    )
+    classes = None
+    if ours := "class" in names and table.dtype["class"].kind == "f":  # others number classes in whole numbers, and otherwise
+        with np.errstate(invalid="ignore"):
+            ids = np.asarray(table["class"], np.float64)
+            classes = np.where((ids >= 0) & (ids <= 255), ids, 255).astype(np.uint8)
+    means = np.stack([table[name].astype(np.float64) for name in "xyz"], 1)
+    logs = columns_of(table, sizes)
+    notes = list(file.notes)
+    if flat:
+        logs = np.column_stack([logs, np.full(len(logs), FLAT_LOG, np.float32)])
+        notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
+    cloud = checked(SplatCloud(means, columns_of(table, _indexed("rot", 4)), logs, np.asarray(table["opacity"], np.float32), sh, classes,
+                               file.antialias), where)  # fmt: skip
+    filters = [name for name in names if name.lower() == "filter_3d"]
+    if filters:
+        cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
+        notes.append("the column filter_3D (Mip-Splatting) went into sizes and opacities")
+    used = {*wanted, *_indexed("f_rest", rest), *_UNREAD, *filters, *(["class"] if ours else [])}
+    passed = [name for name in names if name not in used]
+    moving = [name for name in passed if name.lower().startswith(_MOTION)]
+    warnings = list(file.warnings)
+    if _REST[rest] > 3:
+        warnings.append("harmonics beyond degree 3 were dropped")
+    if moving:
+        warnings.append(f"columns of motion over time are not read: {listed(moving)}; the Gaussians are as they rest")
+    if len(passed) > len(moving):
+        notes.append(sentence([name for name in passed if name not in moving], "element vertex"))
+    single = [axis for axis, name in enumerate("xyz") if table.dtype[name] == np.float32]
+    step = spacing_m(means[:, single]) if single else 0.0
+    return SplatFile(cloud, file.axes, file.axes_by, step, tuple(notes), tuple(warnings))
+
+
+def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) -> None:
+    """InputError unless all columns are there, as numbers with a fraction."""
+    names = table.dtype.names or ()
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        alike = any(name.lower().startswith(("scal", "rot", "quat", "opac", "f_dc", "f_rest", "sh", "feat")) for name in names)
+        remedy = f"name the columns as 3D Gaussian Splatting does: {', '.join(wanted)}" if alike else "points or meshes cannot be imported"
+        raise InputError("the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing", where=where,
+            expected=f"a property {missing[0]!r}", got=listed(names), remedy=remedy)  # fmt: skip
+    whole = [name for name in wanted if name not in "xyz" and table.dtype[name].kind != "f"]
+    if whole:
+        raise InputError("a column of the Gaussians holds whole numbers", where=where, expected=f"{whole[0]} as float",
+            got=str(table.dtype[whole[0]]), remedy="write logits, logarithms of sizes, and harmonics")  # fmt: skip
+
+
+def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> SplatCloud:
+    """Gaussians blurred by a filter f64[n] in metres (Mip-Splatting, eq. 7): sizes grow, opacities fall with the volume."""
+    if not np.isfinite(filter_m).all():
+        raise InputError("a filter_3D is not finite", where=f"{where}: Gaussian {int((~np.isfinite(filter_m)).argmax())}")
+    variance = np.exp(2 * cloud.log_scales.astype(np.float64))
+    grown = variance + (filter_m**2)[:, None]
+    share = np.exp(0.5 * (np.log(variance) - np.log(grown)).sum(1))
+    logs = (0.5 * np.log(grown)).astype(np.float32)
+    return checked(replace(cloud, log_scales=logs, logits=logit(cloud.opacity * share)), where)
+
+
+# -- headers -------------------------------------------------------------------------------------------------------------
+
+
+def marks_of(antialias: bool, z_up: bool) -> list[str]:
+    """Comments on what differs from the usual PLY of Gaussians: they are to be drawn antialiased; the axes are those of this program."""
+    return ["SplatRenderMode: mip"] * antialias + ["Vertical Axis: z"] * z_up
+
+
+def header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: Sequence[str] = ()) -> bytes:
+    """The header of a PLY file: elements with their number of rows and their properties (type, name)."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    for name, count, properties in elements:
+        lines += [f"element {name} {count}", *(f"property {kind} {column}" for kind, column in properties)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode()
+
+
+@dataclass
+class _Element:
+    """An element of the header; a column of a list has the types of its length and of its entries, another one of no length."""
+
+    name: str
+    count: int
+    columns: list[tuple[str, str, str]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlyFile:
+    """Tables of a binary PLY, and what its comments say: the rest as in ``SplatFile``."""
+
+    tables: dict[str, NDArray[Any]]
+    antialias: bool
+    axes: str
+    axes_by: str
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFile:
+    """The wanted elements of a binary PLY as structured arrays that look into ``content``.
+
+    Raises:
+        InputError: no PLY, an ASCII one, a malformed header, wanted elements with lists, or content that is too short.
+    """
+    elements, comments, place, order = _parsed_header(content, where)
+    tables: dict[str, NDArray[Any]] = {}
+    last = max((index for index, element in enumerate(elements) if element.name in wanted), default=-1)
+    for element in elements[: last + 1]:
+        lists = any(length for length, _, _ in element.columns)
+        if lists and element.name in wanted:
+            name = next(name for length, _, name in element.columns if length)
+            raise InputError("the Gaussians of a PLY file have lists", where=f"{where}: element {element.name!r}",
+                got=f"property list {name!r}", remedy="write one property for each number")  # fmt: skip
+        if lists:
+            place = _after_lists(content, place, element, order, where)
+            continue
+        try:
+            dtype = np.dtype([(name, order + kind) for _, kind, name in element.columns])
+        except ValueError as error:
+            raise InputError("two properties of a PLY element have one name", where=where, got=str(error)[:200]) from error
+        size = element.count * dtype.itemsize
+        rows = binary.part(content, place, size, f"element {element.name!r}", where)
+        if dtype.itemsize and element.name in wanted:
+            tables[element.name] = np.frombuffer(rows, dtype)
+        place += size
+    more = [element.name for element in elements if element.name not in wanted and element.count]
+    unknown, warnings = [name for name in more if name not in _ELEMENTS], list[str]()
+    antialias = _antialias(comments, warnings)
+    axes, by = _axes(comments, warnings)
+    offset = next((line for line in comments if re.search(r"(?i)\b(offset|shift|epsg|utm|georef\w*|crs)\b", line)), "")
+    colors = [name for name in more if "color" in name.lower()]
+    if colors:  # of apple/ml-sharp, for example
+        warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
+    if offset:
+        warnings.append(f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)")
+    return PlyFile(tables, antialias, axes, by, (sentence(unknown, "the header"),) if unknown else (), tuple(warnings))
+
+
+def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str], int, str]:
+    """Elements, comments, where the rows begin, and the order of bytes."""
+    if content[:3] != b"ply":
+        raise InputError("not a PLY file", where=where, expected="the first line 'ply'", got=repr(content[:16]))
+    end = content.find(b"end_header", 0, MAX_HEADER)
+    line_end = content.find(b"\n", end, end + 16) if end >= 0 else -1
+    if end < 0 or line_end < 0:
+        raise InputError(
+            "the header of the PLY file does not end", where=where, expected=f"end_header within {MAX_HEADER} bytes"
+        )
+    order, elements, comments = "", list[_Element](), list[str]()
+    for line in content[:end].decode("ascii", "replace").splitlines():
+        words = line.split()
+        if not words or words[0] == "ply":
+            continue
+        if words[0] in ("comment", "obj_info"):
+            comments.append(" ".join(words[1:]))
+        elif words[0] == "format" and len(words) == 3:
+            order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
+            if not order:
+                raise InputError("this kind of PLY is not read", where=where, expected="binary_little_endian", got=words[1][:40],
+                    remedy="save it as a binary PLY")  # fmt: skip
+        elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 12:
+            elements.append(_Element(words[1], int(words[2]), []))
+        elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and elements:
+            elements[-1].columns.append(("", _TYPES[words[1]], words[2]))
+        elif words[:2] == ["property", "list"] and len(words) == 5 and words[2] in _LENGTHS and words[3] in _TYPES and elements:
+            elements[-1].columns.append((_TYPES[words[2]], _TYPES[words[3]], words[4]))
+        else:
+            raise InputError("a line in the header of the PLY file is not understood", where=where, got=repr(line[:80]),
+                expected="format, element NAME COUNT, property TYPE NAME, or property list TYPE TYPE NAME")  # fmt: skip
+    if not order or not elements:
+        raise InputError("the header of the PLY file names no format or no elements", where=where)
+    for element in elements:
+        if element.name in ("vertex", "chunk", "sh"):
+            binary.refuse_count(element.count, f"{where}: element {element.name}")
+    return elements, comments, line_end + 1, order
+
+
+def _after_lists(content: bytes, place: int, element: _Element, order: str, where: str) -> int:
+    """Where the rows of an element with lists, which stand before the Gaussians, end."""
+    if element.count > MOST_LISTS:
+        raise InputError("a PLY file has too many lists before its Gaussians", where=f"{where}: element {element.name!r}",
+            expected=f"at most {MOST_LISTS}", got=str(element.count), remedy="write the vertices first")  # fmt: skip
+    columns = [
+        (struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
+        for length, kind, _ in element.columns
+    ]
+    try:
+        for _ in range(element.count):
+            for length, size in columns:
+                entries = 1
+                if length is not None:
+                    entries = max(length.unpack_from(content, place)[0], 0)
+                    place += length.size
+                place += entries * size
+    except struct.error as error:
+        raise InputError("the file ends within a list", where=f"{where}: element {element.name!r}") from error
+    return place
+
+
+# -- comments ------------------------------------------------------------------------------------------------------------
+
+
+def _antialias(comments: list[str], warnings: list[str]) -> bool:
+    """Whether the last comment on it says that the Gaussians are drawn antialiased."""
+    found = False
+    for line in comments:
+        mode = re.search(r"(?i)\b(?:splat|raster\w*|render)[ _-]?(?:render)?[ _-]?mode\W*(\w+)", line)
+        mark = re.search(r"(?i)(\bnot? )?\banti[ _-]?alias(?:ed|ing)?\b\W*(\w*)", line)
+        if mode and mode[1].lower() in _MODES:
+            found = _MODES[mode[1].lower()]
+        elif mode:
+            warnings.append(f"the comment {line[:80]!r} names a way of drawing that is not known: drawn as usual")
+        elif mark:
+            found = not mark[1] and mark[2].lower() not in ("0", "false", "no", "off", "none", "disabled")
+    return found
+
+
+def _axes(comments: list[str], warnings: list[str]) -> tuple[str, str]:
+    """Axes that a comment states, and the comment."""
+    for line in comments:
+        system = re.search(r"(?i)\bcoordinate[ _-]?(?:system|frame)\W*\b([LRUDFB]{3})\b", line)
+        if system and known(system[1].upper()):
+            return system[1].upper(), f"the comment {line[:80]!r}"
+        up = re.search(r"(?i)\b(vertical|up)[ _-]?(?:axis)?\s*[:=]?\s*([+-]?[xyz])\b", line)
+        after = re.search(r"(?i)(?<![\w+-])([+-]?[xyz])[ _-]?(?:axis )?(?:is )?up\b", line)
+        if up is None and after is None:
+            continue
+        axis = (up[2] if up else after[1] if after else "").lower().removeprefix("+")
+        if axis == "y" and (up is None or up[1].lower() == "up"):
+            return "RUB", f"the comment {line[:80]!r}"
+        if axis in VERTICAL:
+            return VERTICAL[axis], f"the comment {line[:80]!r}"
+        if not any("brush" in other.lower() for other in comments):  # which writes it into every file
+            warnings.append(f"the comment {line[:80]!r} does not tell whether y points up or down: read with y down, as usual; "
+                            "if it stands on its head, add --axes RUB")  # fmt: skip
+    return "", ""
+
+
+# -- columns -------------------------------------------------------------------------------------------------------------
+
+
+def columns_of(table: NDArray[Any], names: tuple[str, ...]) -> NDArray[np.float32]:
+    """Columns of a structured array as f32[n, len(names)]."""
+    made = np.empty((len(table), len(names)), np.float32)
+    for index, name in enumerate(names):
+        with np.errstate(over="ignore", invalid="ignore"):
+            made[:, index] = table[name]
+    return made
+
+
+def _indexed(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}_{index}" for index in range(count))
+
+
+def _names(degree: int) -> tuple[str, ...]:
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return ("x", "y", "z", "nx", "ny", "nz", *_indexed("f_dc", 3), *_indexed("f_rest", rest), "opacity", *_indexed("scale", 3),
+            *_indexed("rot", 4))  # fmt: skip
+
+
+def channel_major(sh: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Harmonics from degree 1 on, f32[n, K, 3] to f32[n, 3 (K - 1)]: all of red, all of green, all of blue."""
+    return sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)
+
+
+def coefficient_major(rest: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Inverse of ``channel_major``: f32[n, K - 1, 3]."""
+    return rest.reshape(len(rest), 3, rest.shape[1] // 3).transpose(0, 2, 1)

@@ -1,0 +1,1 @@
+"""The dynamic Gaussian scene: model, nodes, fit loop, renders, storage."""

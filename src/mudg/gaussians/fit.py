@@ -1,0 +1,552 @@
+"""fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
+
+The loop is ``optimise`` and reads top to bottom. What it calls: ``gaussians/views.py`` (what a view is), ``gaussians/start.py`` (where the
+Gaussians start), ``models.scene.model.compose`` (the scene at a time), ``core.raster`` (the renderer), ``core.losses`` (every
+loss), ``models.scene.densify``. Nothing else touches the parameters.
+
+    OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty
+    OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
+    OUT/log.jsonl, preview/*.png                                how it went
+    OUT/field.safetensors                                       instead of the Gaussians, for method emernerf (``baselines/emernerf``)
+    OUT/steps/                                                  checkpoints, while it runs
+
+With ``start`` it goes on with a finished fit (``gaussians/storage.py``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mudg.base import checkpoint, log, palette, store
+from mudg.base.devices import memory_of
+from mudg.base.errors import UsageError
+from mudg.base.processes import Interruption, one_torch_thread
+from mudg.base.run_folder import RunDir, VerbOutput
+from mudg.base.types import FusedCloud, Gaussians, Render, Scene
+from mudg.core import losses, metrics, native_ops
+from mudg.core.pictures import panels_of
+from mudg.core.raster.place import drawing_device
+from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.densify import (
+    DensifySettings,
+    DensifyStats,
+    McmcSettings,
+    densify,
+    drift,
+    relocate_and_grow,
+    reset_opacity,
+    shorten_needles,
+)
+from mudg.gaussians.methods import METHODS
+from mudg.gaussians.model import CERTAINTY, SceneModel, compose, composite_sky, sky_lift
+from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.perception import Perception, perception_of
+from mudg.gaussians.poses import refine_poses
+from mudg.gaussians.recipes import DrawnView, recipe_of
+from mudg.gaussians.rendering import NEAR_M as NEAR_M
+from mudg.gaussians.rendering import boxes_in_view, check_drawing, drawing_facts, objects_only, raster_of
+from mudg.gaussians.rendering import render_view as render_view
+from mudg.gaussians.schedule import FiniteCheck, appearance_rates, densify_schedule, learning_rates, pose_round_due
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.storage import (
+    StartFit,
+    all_classes,
+    begun_at,
+    continued_appearance,
+    continued_model,
+    save_appearance,
+    save_model,
+    whole_run,
+)
+from mudg.gaussians.storage import load_model as load_model
+from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
+from mudg.gaussians.views import (
+    HalvedViews,
+    StoredView,
+    TrainView,
+    ViewSet,
+    chosen_ahead,
+    classes_of,
+    fused_lidar,
+    heads_of,
+    keep,
+    load_recorded,
+    load_virtual,
+    recorded_bytes,
+    scratch_folder,
+    training_frames,
+    virtual_bytes,
+)
+from mudg.scene.clouds import read_fused
+from mudg.scene.fuse import fused_without_boxes
+from mudg.scene.observations import ObservationSet
+from mudg.scene.read import read_scene
+
+OUTPUT = VerbOutput(
+    "fit", 3,
+    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "field.safetensors",
+     "preview/*.png", "steps/"),
+)  # fmt: skip
+FARTHEST_VIRTUAL_DEPTH_M = 100.0
+SHAPE_EVERY = 10
+EXPOSURE_WEIGHT = 0.01
+"""Weight that pulls the colour maps of recorded and virtual views towards the identity."""
+LEAST_WITNESSES, WITNESS_SHARE = 8, 0.015
+"""Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a step)."""
+MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
+"""Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
+
+
+def learns_virtual(method: str) -> bool:
+    """Whether fits of a method learn from virtual views."""
+    return bool({"virtual", "repaired"} & set(METHODS[method].supervision))
+
+
+def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> None:
+    """UsageError where a method lacks what it needs: fused clouds, virtual views, a finished fit, or a setting."""
+    if not fused:
+        raise UsageError(f"{config.method} needs fused clouds", remedy="run `mudg fuse` and give its folder as --fused")
+    recipe_of(config.method).check(config, continued)
+    if learns_virtual(config.method) and not virtual:
+        remedy = "run `mudg synthesize` and give its folder as --observations, or choose --method street_gaussians"
+        raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
+
+
+def check_device(config: FitConfig) -> torch.device:
+    """Where it is fitted.
+
+    Raises:
+        UsageError: the method or the drawing cannot be there. ResourceError: there is no such device.
+    """
+    device = drawing_device(config.device, "fit", config.raster)
+    check_drawing(config, device)
+    return device
+
+
+@dataclass(frozen=True)
+class FitInputs:
+    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it goes on with."""
+
+    scene: Path
+    fused: Path
+    virtual: Mapping[str, ObservationSet] = field(default_factory=dict)
+    start: StartFit | None = None
+
+
+def write_fit(config: FitConfig, given: FitInputs, work: RunDir) -> dict[str, Any]:
+    """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest checkpoint.
+
+    Raises:
+        NumericsError: a loss or gradient is not finite. InputError: damaged inputs.
+    """
+    device = check_device(config)
+    config = recipe_of(config.method).used(config)
+    if given.start is not None:
+        config = whole_run(config)
+    with one_torch_thread(), memory_of(device, "fit"):
+        state = _prepare(config, given, work.path).to(device)
+        with contextlib.closing(state.views):
+            optimise(state, config, work)
+            add_certainty(state, config)
+    save_model(state.model, work.path)
+    save_appearance(state.appearance, work.path)
+    shutil.rmtree(work.path / "steps", ignore_errors=True)
+    return state.summary()
+
+
+@dataclass
+class FitState:
+    """Everything that changes while fitting, and what it is fitted to."""
+
+    model: SceneModel
+    views: ViewSet
+    stats: DensifyStats
+    schedule: DensifySettings | McmcSettings | None
+    step: int
+    seconds: float = 0.0
+    last: Mapping[str, float] | None = None
+    appearance: Appearance = field(default_factory=lambda: Appearance({}))
+    begun_at: int = 0
+    """Steps of the schedule that counted as done when the fit began: above 0 where it goes on with a finished one."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is that a step changes; views are sent there one by one."""
+        return self.model.device
+
+    def to(self, device: torch.device) -> FitState:
+        """The same state on a device."""
+        model, stats, appearance = self.model.to(device), self.stats.to(device), self.appearance.to(device)
+        return replace(self, model=model, stats=stats, appearance=appearance)
+
+    def summary(self) -> dict[str, Any]:
+        """For run.json."""
+        counts = {"gaussians": len(self.model.table), "steps": self.step - self.begun_at}
+        return {**counts, "seconds": round(self.seconds, 2), **(self.last or {})}
+
+
+def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
+    """Read views, then continue from the newest checkpoint or build the starting model."""
+    scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
+    if not METHODS[config.method].boxes:
+        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, given.fused)
+    frames, invented = training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
+    needed = recorded_bytes(frames, config.width_px) + virtual_bytes(given.virtual)
+    scratch = scratch_folder(len(frames) + invented, needed, out)
+    views, classes = recorded_views(config, scene, given.virtual, start, scratch)
+    if given.virtual:
+        measured = fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
+        views = replace(views, virtual=keep(load_virtual(given.virtual, classes, measured), invented, scratch))
+    found = checkpoint.latest(out / "steps")
+    if found is None:
+        return start_state(config, scene, fused, views, classes) if start is None else continued_state(config, start, views, classes)
+    log.info(f"resuming at step {found.step} of {config.iterations}")
+    model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
+    stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
+    return FitState(
+        model, views, DensifyStats.from_state(stats), _schedule_of(config), found.step, float(found.state["seconds"]),
+        found.state["last"], appearance, 0 if start is None else begun_at(config.iterations),
+    )  # fmt: skip
+
+
+def recorded_views(
+    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None, start: StartFit | None = None,
+    scratch: Path | None = None,
+) -> tuple[ViewSet, tuple[int, ...]]:  # fmt: skip
+    """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels (those that
+    ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in memory."""
+    frames = training_frames(scene, config.cameras)
+    classes = classes_of(scene, frames, virtual or {}) if config.semantics else ()
+    classes = classes if start is None else all_classes(start, classes)
+    with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
+    loaded = load_recorded(scene, frames, classes, config.width_px, with_lidar)
+    return ViewSet(keep(loaded, len(frames), scratch), ()), classes
+
+
+def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]) -> FitState:
+    """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
+    model = recipe_of(config.method).start(scene, cloud, views.recorded, classes, config)
+    model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
+    model.facts |= drawing_facts(config.drawing)
+    stats = DensifyStats.zeros(len(model.table))
+    return FitState(model, views, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, views))
+
+
+def _schedule_of(config: FitConfig) -> DensifySettings | McmcSettings | None:
+    return densify_schedule(config, recipe_of(config.method).last_densified)
+
+
+def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes: tuple[int, ...]) -> FitState:
+    """The state of a fit that goes on with a finished one; ``config`` is that of the whole run."""
+    model = continued_model(start, classes, config)
+    model.facts |= {"method": config.method, "classes": [palette.CLASSES[i] for i in classes]}
+    appearance = continued_appearance(start, _nothing_corrected(config, views))
+    log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
+    stats, step = DensifyStats.zeros(len(model.table)), begun_at(config.iterations)
+    return FitState(model, views, stats, _schedule_of(config), step, appearance=appearance, begun_at=step)
+
+
+def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:
+    wanted = config.appearance
+    return Appearance.of_views(
+        [head.name for head in heads_of(views.recorded)], [head.name for head in heads_of(views.virtual)],
+        wanted.exposure, wanted.cameras, wanted.virtual,
+    )
+
+
+def add_certainty(state: FitState, config: FitConfig) -> None:
+    """Note in the model how well the photographs constrain every Gaussian (``gaussians/trust.py``)."""
+    raster, most = raster_of(state.model, config.raster), max(LEAST_WITNESSES, round(WITNESS_SHARE * config.iterations))
+    state.model.table.labels[CERTAINTY] = certainty_of(state.model, state.views.recorded, raster, state.appearance, most)
+
+
+# ---- the loop ------------------------------------------------------------------------------------------------------
+
+
+def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
+    """Fit ``state.model`` to its views up to step ``config.iterations``, one view each (or two, see ``VirtualConfig.beside``).
+
+    Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
+    that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
+    """
+    raster, perception = raster_of(state.model, config.raster, config.drawing.packed), perception_of(config.virtual, state.device)
+    virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
+    virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
+    sizes = HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
+
+    def choose(step: int) -> tuple[StoredView, ...]:
+        probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
+        return tuple(sizes.sized(view, step) for view in state.views.choose(config.seed, step, probability, config.virtual.beside))
+
+    with (
+        log.task(f"fit {config.method}", config.iterations, state.step) as bar,
+        Interruption() as interruption,
+        # The one way to the device; results come back in gaussians/rendering.py.
+        chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
+    ):
+        while state.step < config.iterations:
+            began = time.perf_counter()
+            step = state.step + 1
+            if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
+                start_unseen_gaussians(state, config, raster)
+            views = next(upcoming)
+            check = FiniteCheck(step, at_once=state.device.type == "cpu")
+            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views]
+            check.refuse()
+            adam_step(state.model, step, config.iterations, state.begun_at)
+            state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
+            if step % SHAPE_EVERY == 0:
+                shorten_needles(state.model.table, config.densify.longest_to_middle)
+                settle_nodes(state.model, config, step)
+            if pose_round_due(config, step):
+                moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
+                folder.log(step=step, boxes_moved_m=round(moved_m, 5))
+            densified = _densify_if_due(state, config, step)
+
+            state.step, state.seconds = step, state.seconds + time.perf_counter() - began
+            if step % 20 == 0 or step == config.iterations or densified:
+                state.last = _progress(state, views[0], *learnt[0])
+                folder.log(step=step, view=views[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
+                shown = f"psnr {state.last['psnr']:.1f}, " if "psnr" in state.last else ""
+                bar.update(f"{shown}{len(state.model.table)} Gaussians")
+            if step % config.preview_every == 0 or step == config.iterations:
+                write_preview(state, raster, folder.path / "preview" / f"{step:06d}.png")
+            if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
+                with pace.saving():
+                    save_checkpoint(state, folder.path / "steps")
+            bar.advance()
+            if interruption.requested:
+                folder.pause(state.summary())
+                interruption.stop_now()
+
+
+@dataclass(frozen=True)
+class LearnStep:
+    """What a step does with each of its views.
+
+    Args:
+        check: takes what must be finite.
+        first: whether it is the first view of this step; terms that do not depend on the view count with it.
+    """
+
+    config: FitConfig
+    raster: RasterConfig
+    perception: Perception
+    check: FiniteCheck
+    step: int
+    first: bool
+
+
+class LearntPicture(NamedTuple):
+    """What a step rendered: colours f32[3, H, W] without the sky, and coverage f32[1, H, W]."""
+
+    rgb: Tensor
+    alpha: Tensor
+
+
+def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[LearntPicture, dict[str, Tensor]]:
+    """Render a view and add the gradients of its loss to the parameters'.
+
+    Returns:
+        The picture (not all that was rendered: that would stay in memory while the next view is), and the weighted loss terms.
+    """
+    config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
+    recorded = view.kind == "recorded"
+    model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
+    growing = recorded and isinstance(state.schedule, DensifySettings) and step <= state.schedule.stop
+    with_classes = not recorded or step % config.loss.semantic_every == 0
+    gaussians = compose(model, view.view.time_s, with_classes)
+    pose = state.appearance.world_from_cam(view.view, view.name) if recorded else None
+    render = rasterize(gaussians, view.view, raster, absgrad=growing, world_from_cam=pose)
+    if recorded:
+        terms = recorded_terms(state, render, view, recipe.common(config))
+        terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
+    else:
+        terms = virtual_terms(state, render, view, config, how.perception)
+    terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(state, gaussians, view, config, raster, step)
+    how.check.terms(view.name, terms)
+    torch.stack(list(terms.values())).sum().backward()
+    how.check.gradients(view.name, state.model, state.appearance)
+    if growing:
+        camera = view.view.camera
+        timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
+        state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0], timed)
+    return LearntPicture(render.rgb.detach(), render.alpha.detach()), {name: term.detach() for name, term in terms.items()}
+
+
+def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
+    """When virtual views join: start Gaussians at the surfaces that only they show (see ``gaussians/trust.py``)."""
+    unseen = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
+    columns, labels, share = unseen_rows(state.model, unseen, config.virtual.gaussians, config.seed)
+    there = [{name: value.to(state.device) for name, value in of.items()} for of in (columns, labels)]
+    state.model.table.append(*there)
+    state.model.sort_rows()
+    state.stats = DensifyStats.zeros(len(state.model.table), state.device)
+    log.info(f"virtual views: {share:.0%} of their pixels show what no recorded view saw")
+
+
+def _picture(state: FitState, render: Render, view: TrainView) -> Tensor:
+    """The rendered colours ``[3, H, W]`` over the sky, as the camera (or generator) of the view would show them."""
+    rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
+    return state.appearance.colored(rgb, view.name, view.kind)
+
+
+def recorded_terms(state: FitState, render: Render, view: TrainView, config: FitConfig) -> dict[str, Tensor]:
+    """Weighted loss terms of a recorded view: colour, LiDAR depth, sky, semantics (those that apply).
+
+    The view's confidence is that of its labels (a labeller may be unsure; the photograph is not).
+    """
+    weights = config.loss
+    labels = view.confidence * view.mask
+    everywhere = state.device.type == "cpu" and bool(view.mask.all())  # to ask another device is to wait for it
+    rgb = losses.outside_mask_copied(_picture(state, render, view), view.rgb, None if everywhere else view.mask)
+    terms = {"color": native_ops.photometric(rgb, view.rgb, weights.ssim_weight)}
+    if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
+        terms["lidar"] = weights.lidar_weight * losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
+    if view.sky is not None and weights.sky_weight and state.model.sky is not None:
+        terms["sky"] = weights.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, view.sky), labels)
+    if render.extra is not None and view.channels is not None and weights.semantic_weight:
+        total = labels.sum().double().clamp_min(1e-12) / weights.semantic_weight
+        terms["semantics"] = native_ops.class_loss(render.extra, view.channels, labels[0], total, sky_lift(state.model, render.alpha))
+    return terms
+
+
+def virtual_terms(
+    state: FitState, render: Render, view: TrainView, config: FitConfig, perception: Perception
+) -> dict[str, Tensor]:
+    """Weighted loss terms of a virtual view, every pixel weighted by the view's confidence."""
+    weights = config.virtual
+    sure = view.confidence if weights.confidence_power == 1 else view.confidence**weights.confidence_power
+    weight = sure * view.mask
+    rgb = _picture(state, render, view)
+    terms: dict[str, Tensor] = {}
+    if weights.color_weight:
+        terms["virtual_color"] = weights.color_weight * native_ops.photometric(rgb, view.rgb, weights.ssim_weight, weight[0])
+    if weights.perceptual_weight:
+        terms["virtual_perceptual"] = weights.perceptual_weight * perception(rgb, view.rgb, weight)
+    if view.depth is not None and weights.depth_weight:
+        valid = torch.isfinite(view.depth) & (view.depth > 0) & (view.depth < FARTHEST_VIRTUAL_DEPTH_M)
+        loss = losses.dense_depth_map(render.depth, torch.where(valid, view.depth, 1.0))
+        terms["virtual_depth"] = weights.depth_weight * losses.confident_mean(loss, weight * valid)
+    if view.lidar is not None and len(view.lidar.pixel) and weights.lidar_weight:
+        loss = losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
+        terms["virtual_lidar"] = weights.lidar_weight * loss
+    if view.sky is not None and weights.sky_weight and state.model.sky is not None:
+        terms["virtual_sky"] = weights.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, view.sky), weight)
+    if render.extra is not None and view.channels is not None and weights.semantic_weight:
+        total, lift = weight[0].numel() / weights.semantic_weight, sky_lift(state.model, render.alpha)
+        terms["virtual_semantics"] = native_ops.class_loss(render.extra, view.channels, weight[0], total, lift)
+    return terms
+
+
+def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
+    """Weighted mean opacity and mean scale of all Gaussians; unset weights are those published with ``mcmc``, else 0."""
+    published = config.densify.kind == "mcmc"
+    opacity_weight, scale_weight = config.loss.opacity_weight, config.loss.scale_weight
+    if opacity_weight is None:
+        opacity_weight = MCMC_OPACITY_WEIGHT if published else 0.0
+    if scale_weight is None:
+        scale_weight = MCMC_SCALE_WEIGHT if published else 0.0
+    return losses.opacity_and_scale(gaussians.opacity, gaussians.scales, opacity_weight, scale_weight)
+
+
+def correction_terms(
+    state: FitState, gaussians: Gaussians, view: TrainView, config: FitConfig, raster: RasterConfig, step: int
+) -> dict[str, Tensor]:
+    """Weighted terms that hold what is learnt to what is known: colour maps near the identity, objects within their boxes
+    (once densification is over)."""
+    terms: dict[str, Tensor] = {}
+    distance = state.appearance.penalty(view.name, view.kind)
+    if distance is not None:
+        terms["exposure"] = EXPOSURE_WEIGHT * distance
+    if config.loss.object_weight and view.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
+        alpha = rasterize(objects_only(gaussians), view.view, raster).alpha
+        inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)
+        terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
+    return terms
+
+
+def _settled(schedule: DensifySettings | McmcSettings | None, step: int) -> bool:
+    """Whether the number of Gaussians does not change any more after a step."""
+    return schedule is None or step > schedule.stop
+
+
+def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
+    """Regularise what nodes learn per key of their track, less and less as the steps of the optimiser shrink."""
+    share = learning_rates(step, config.iterations)["deform"] / learning_rates(1, config.iterations)["deform"]
+    for node in model.nodes:
+        if isinstance(node, RigidNode):
+            node.after_step(share)
+
+
+# ---- the optimiser ---------------------------------------------------------------------------------------------------
+
+
+def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) -> None:
+    """One Adam step on every table of the model, then gradients are dropped; moments are those of the steps after ``begun_at``."""
+    rates = learning_rates(step, iterations)
+    for table in (model.table, *model.node_tables().values()):
+        table.adam_step(step - begun_at, rates, native_ops.adam_columns)
+        table.clear_gradients()
+
+
+def _densify_if_due(state: FitState, config: FitConfig, step: int) -> dict[str, Any]:
+    """What the schedule has for this step, after the optimiser's; a report if rows changed."""
+    model, schedule = state.model, state.schedule
+    report: dict[str, Any] = {}
+    if isinstance(schedule, McmcSettings):
+        if schedule.due(step):
+            report = relocate_and_grow(model, step, schedule, config.seed)
+        drift(model, step, learning_rates(step, config.iterations)["means"], schedule, config.seed)
+    elif schedule is not None:
+        if schedule.due(step):
+            report = densify(model, state.stats, step, schedule, config.seed)
+        if schedule.reset_due(step):
+            reset_opacity(model, schedule)
+    if report:
+        state.stats = DensifyStats.zeros(len(model.table), model.device)
+    return report
+
+
+# ---- on disk -------------------------------------------------------------------------------------------------------
+
+
+def save_checkpoint(state: FitState, folder: Path) -> None:
+    """All that changes: model with moments, statistics, step."""
+    values, groups = state.model.state()
+    groups = {**groups, "stats": state.stats.state()}
+    names, groups["appearance"] = state.appearance.state()
+    groups["appearance"] = groups["appearance"] or {"none": torch.zeros(1)}
+    facts = {"model": values, "seconds": state.seconds, "last": dict(state.last or {}), "appearance": names}
+    checkpoint.save(folder, state.step, groups, facts)
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+
+def _progress(state: FitState, view: TrainView, render: LearntPicture, terms: Mapping[str, Tensor]) -> dict[str, float]:
+    with torch.no_grad():
+        rgb = composite_sky(state.model, view.view, render.rgb, render.alpha)
+        psnr = metrics.psnr(rgb, view.rgb, view.mask)
+        values = torch.stack(list(terms.values())).tolist()
+    seen = {} if math.isnan(psnr) else {"psnr": round(min(psnr, 99.0), 3)}  # no pixel of a generated view may count
+    return {**seen, **{f"loss_{name}": round(value, 6) for name, value in zip(terms, values)}}
+
+
+def write_preview(state: FitState, raster: RasterConfig, path: Path) -> None:
+    """A picture: truth, render, depth, semantics of the middle recorded view."""
+    stored = state.views.recorded[len(state.views.recorded) // 2]
+    seen = render_view(state.model, stored.view, raster)
+    store.write_image(path, np.concatenate([stored.rgb, *panels_of(seen)], 1))

@@ -1,0 +1,207 @@
+"""Correct the boxes of dynamic objects from the pictures: a few Gauss-Newton rounds in the course of a fit.
+
+A key of a track has four unknowns: a shift along the box's three axes, and a yaw. Three kinds of evidence are solved for together:
+
+    pictures   the rendered colours inside the box's outline should become the recorded ones
+    track      the correction should stay near the track, once the noise of the track is taken out (``RigidNode.settled_offsets``)
+    motion     the correction should accelerate no more than road users do (so neighbouring keys are corrected alike)
+
+Each is weighted by its expected error. What the pictures cannot tell (the yaw of a distant car) therefore stays with the track and its
+neighbours in time; a gradient method that scales its steps to the gradients, as Adam does, walks at random there. Derivatives are
+differences of renders: all objects of a view are displaced together, so a view costs five pictures without gradients.
+
+LiDAR depth is not used: with a known scene, colours alone took 0.13 m of drift to under 0.02 m; with depths beside them it stayed
+above 0.06 m. At the edge of an object a rendered depth is a mean of near and far, and the nearest return is not that of the pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import geometry
+from mudg.base.types import Gaussians
+from mudg.core.harmonics import left_product_matrix
+from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.gaussians import nodes as motion
+from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.model import SceneModel, compose, composite_sky
+from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.rendering import outline_mask
+from mudg.gaussians.views import StoredView
+
+STEPS: tuple[float, ...] = (0.02, 0.02, 0.02, 0.005)
+"""Displacements of the differences: metres along x, y, z of the box, radians of yaw."""
+TRUST_M, TRUST_RAD = 0.1, 0.02
+"""How far from the truth a track may be though it is smooth (drift of a filter, a labeller's taste)."""
+LARGEST_M, LARGEST_RAD = 0.2, 0.05
+"""A round moves a key by at most this."""
+FEWEST_PX = 30
+BLUR_PX = 3
+COLOR_SIGMA = 0.03
+COLOR_SHARE = 1 / 120
+"""What one channel of one pixel counts for: neighbours are blurred together, and the model errs where they do."""
+
+
+@dataclass
+class PoseEvidence:
+    """Sums of the pictures' normal equations: ``matrix`` f64[K, 4, 4] and ``vector`` f64[K, 4] per key of one object."""
+
+    matrix: NDArray[np.float64]
+    vector: NDArray[np.float64]
+    views: int = field(default=0)
+
+    @classmethod
+    def none(cls, keys: int) -> PoseEvidence:
+        """Nothing seen yet."""
+        return cls(np.zeros((keys, 4, 4)), np.zeros((keys, 4)))
+
+
+@torch.no_grad()
+def refine_poses(
+    model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance | None = None
+) -> float:
+    """One round for every node that learns its pose, in place.
+
+    Returns:
+        Root mean square of the moves, metres.
+    """
+    learning = {
+        index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose
+    }
+    evidence = {index: PoseEvidence.none(len(node.times_s)) for index, node in learning.items()}
+    for stored in views:
+        outlines = {index: mask.to(model.device, non_blocking=True) for index, mask in _outlines(learning, stored).items()}
+        if outlines:
+            _add_evidence(model, stored, outlines, evidence, raster, appearance)
+    moves = [_move(node, evidence[index]) for index, node in learning.items() if evidence[index].views]
+    return float(np.sqrt(np.mean(np.concatenate(moves) ** 2))) if moves else 0.0
+
+
+def _outlines(learning: dict[int, RigidNode], stored: StoredView) -> dict[int, Tensor]:
+    """Bool[H, W] per node index: pixels inside the outline of its box that may be used; objects that show too few are left out."""
+    found = {}
+    for index, node in learning.items():
+        pose = node.pose_matrix(stored.view.time_s)
+        mask = None if pose is None else outline_mask(stored.view, pose, node.size_m)
+        if mask is None:
+            continue
+        if stored.mask is not None:
+            mask = mask & stored.mask
+        if mask.sum() >= FEWEST_PX:
+            found[index] = torch.from_numpy(mask)
+    return found
+
+
+def _add_evidence(
+    model: SceneModel, stored: StoredView, outlines: dict[int, Tensor], evidence: dict[int, PoseEvidence], raster: RasterConfig,
+    appearance: Appearance | None,
+) -> None:  # fmt: skip
+    """Add what one recorded view tells about the objects in it."""
+    time_s = stored.view.time_s
+    here = compose(model, time_s, semantics=False)
+    rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}  # type: ignore[operator]
+    poses = {index: model.nodes[index].pose_matrix(time_s) for index in outlines}  # type: ignore[union-attr]
+    color = _picture(model, here, stored, raster, appearance)
+    target = _blurred(torch.from_numpy(stored.rgb).to(model.device, non_blocking=True).permute(2, 0, 1).float() / 255)
+    changes = []
+    for axis, step in enumerate(STEPS):
+        moved = _displaced(here, rows, poses, axis, step)
+        changes.append((_picture(model, moved, stored, raster, appearance) - color) / step)
+    missing = target - color
+    for index, outline in outlines.items():
+        jacobian = torch.stack([change[:, outline].flatten() for change in changes], 1).double()
+        matrix, vector = _normal_equations(jacobian, missing[:, outline].flatten().double())
+        _add_to_keys(model.nodes[index], time_s, matrix, vector, evidence[index])  # type: ignore[arg-type]
+
+
+def _add_to_keys(
+    node: RigidNode, time_s: float, matrix: NDArray[np.float64], vector: NDArray[np.float64], into: PoseEvidence
+) -> None:
+    """Add the evidence of a moment to the two keys around it, by their share in the pose."""
+    found = node.keys_around(time_s)
+    if found is None:
+        return
+    before, after, u = found
+    for key, share in ((before, 1.0 - u), (after, u)):
+        into.matrix[key] += share**2 * matrix
+        into.vector[key] += share * vector
+    into.views += 1
+
+
+def _picture(
+    model: SceneModel, gaussians: Gaussians, stored: StoredView, raster: RasterConfig, appearance: Appearance | None
+) -> Tensor:
+    """Blurred colour ``[3, H, W]``."""
+    pose = None if appearance is None else appearance.world_from_cam(stored.view, stored.name)
+    drawn = rasterize(gaussians, stored.view, raster, world_from_cam=pose)
+    rgb = composite_sky(model, stored.view, drawn.rgb, drawn.alpha)
+    rgb = rgb if appearance is None else appearance.colored(rgb, stored.name, "recorded")
+    return _blurred(rgb)
+
+
+def _blurred(rgb: Tensor) -> Tensor:
+    return F.avg_pool2d(rgb[None], BLUR_PX, stride=1, padding=BLUR_PX // 2, count_include_pad=False)[0]
+
+
+def _displaced(
+    gaussians: Gaussians, rows: dict[int, Tensor], poses: dict[int, NDArray[np.float64] | None], axis: int, step: float
+) -> Gaussians:
+    """The Gaussians with every listed object displaced in its own frame along (axis 0..2) or about z (axis 3)."""
+    means, quats = gaussians.means.clone(), gaussians.quats.clone()
+    shift = np.zeros(3)
+    if axis < 3:
+        shift[axis] = step
+    move = geometry.yaw_matrix(step if axis == 3 else 0.0, shift)
+    for index, mine in rows.items():
+        pose = poses[index]
+        if pose is None:
+            continue
+        world = pose @ move @ geometry.invert(pose)
+        rotation, shift_m = (torch.from_numpy(part).float().to(means.device, non_blocking=True) for part in (world[:3, :3], world[:3, 3]))
+        means[mine] = means[mine] @ rotation.T + shift_m
+        if axis == 3:
+            turn = left_product_matrix(torch.from_numpy(geometry.quaternion_from_matrix(world)).float())
+            quats[mine] = quats[mine] @ turn.to(quats.device, non_blocking=True).T
+    return replace(gaussians, means=means, quats=quats)
+
+
+def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``J^T W J`` and ``J^T W r`` with Huber weights: rows whose residual exceeds two sigma count less.
+
+    Sigma is what the residuals themselves say (median, at least `COLOR_SIGMA`): a model that is still blurred has less to say.
+    """
+    sigma = max(COLOR_SIGMA, 1.4826 * float(missing.abs().median()))
+    weight = COLOR_SHARE / sigma**2 * torch.clamp(2 * sigma / missing.abs().clamp_min(1e-9), max=1.0)
+    weighted = jacobian * weight[:, None]
+    return (jacobian.T @ weighted).cpu().numpy(), (weighted.T @ missing).cpu().numpy()
+
+
+def _move(node: RigidNode, evidence: PoseEvidence) -> NDArray[np.float64]:
+    """Solve for all keys of a track together and move them; returns the moves f64[K, 3] in metres.
+
+    Unknown is the correction c of every key beyond ``settled_offsets``, which have weighed noise against motion already: the sum of
+    squares of what the pictures miss, of c in units of `TRUST_M` and `TRUST_RAD`, and of its accelerations in usual ones.
+    """
+    keys, base = len(node.times_s), node.world_from_object
+    settled = np.column_stack(node.settled_offsets())
+    now = np.column_stack(node.offset_values()) - settled
+    system = np.zeros((keys, 4, keys, 4))
+    for key in range(keys):
+        system[key, :, key, :] = evidence.matrix[key] + np.diag([TRUST_M**-2] * 3 + [TRUST_RAD**-2])
+    difference = motion.second_differences(node.times_s)
+    path = np.einsum("mk,kwc->mwkc", difference, base[:, :3, :3]) / motion.ACCELERATION_M_S2
+    system[:, :3, :, :3] += np.einsum("mwkc,mwld->kcld", path, path, optimize=True)
+    system[:, 3, :, 3] += difference.T @ difference / motion.YAW_ACCELERATION_RAD_S2**2
+    right = evidence.vector + np.einsum("kcd,kd->kc", evidence.matrix, now)
+    found = np.linalg.solve(system.reshape(4 * keys, 4 * keys), right.reshape(4 * keys)).reshape(keys, 4)
+    largest = np.array([LARGEST_M] * 3 + [LARGEST_RAD])
+    moves = np.clip(found - now, -largest, largest)
+    node.add_offsets(moves[:, :3], moves[:, 3])
+    return moves[:, :3]

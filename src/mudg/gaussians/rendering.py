@@ -1,0 +1,212 @@
+"""Renders of a fitted scene: as an observation, and as what a generator may start from, with the certainty of every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from mudg.base import geometry, palette
+from mudg.base.errors import UsageError
+from mudg.base.types import Gaussians, Observation, Render, RenderPlanes, View
+from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize, refuse_settings
+from mudg.gaussians.model import SceneModel, compose, composite_semantics, composite_sky
+from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.settings import DrawingConfig, FitConfig
+
+# dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view ----------------------------
+
+
+BOX_GROWTH = 1.05
+NEAREST_CORNER_M = 0.3
+
+
+def objects_only(gaussians: Gaussians) -> Gaussians:
+    """The rows of dynamic objects (node above 0), without class channels."""
+    if gaussians.node is None:
+        raise ValueError("the Gaussians have no node index")
+    rows = gaussians.node > 0
+    return replace(
+        gaussians, means=gaussians.means[rows], quats=gaussians.quats[rows], scales=gaussians.scales[rows],
+        opacity=gaussians.opacity[rows], sh=gaussians.sh[rows],
+        sh_rest=None if gaussians.sh_rest is None else gaussians.sh_rest[rows], extra=None, node=gaussians.node[rows],
+    )  # fmt: skip
+
+
+def boxes_in_view(model: SceneModel, view: View) -> Tensor:
+    """Bool[1, H, W]: inside the outline of some object's box (slightly grown)."""
+    inside = np.zeros((view.camera.height, view.camera.width), bool)
+    for node in model.nodes:
+        pose = node.pose_matrix(view.time_s) if isinstance(node, RigidNode) else None
+        if pose is not None and isinstance(node, RigidNode):
+            mask = outline_mask(view, pose, node.size_m)
+            inside = inside if mask is None else inside | mask
+    return torch.from_numpy(inside)[None]
+
+
+def outline_mask(
+    view: View, world_from_object: NDArray[np.float64], size_m: tuple[float, ...]
+) -> NDArray[np.bool_] | None:
+    """Bool[H, W]: inside the outline of a box, slightly grown. None: nothing of it is in view. A box that reaches behind the camera
+    covers everything."""
+    camera, grown_m = view.camera, BOX_GROWTH * np.asarray(size_m)
+    corners = geometry.transform_points(view.cam_from_world @ world_from_object, geometry.box_corners(grown_m))
+    if corners[:, 2].max() >= NEAREST_CORNER_M > corners[:, 2].min():
+        return np.ones((camera.height, camera.width), bool)
+    hull = geometry.box_hull(view, world_from_object, grown_m, NEAREST_CORNER_M)
+    if hull is None:
+        return None
+    canvas = Image.new("1", (camera.width, camera.height))
+    outline = [tuple(point) for point in (hull.points[hull.vertices] - 0.5).tolist()]
+    ImageDraw.Draw(canvas).polygon(outline, fill=1, outline=1)
+    return np.array(canvas, bool)
+
+
+# rendering ------------------------------------------------------------------------------------------------------------
+
+
+NEAR_M = 0.2
+DRAWING: Final = "drawing"
+"""Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there: the usual ones."""
+Rendered = TypeVar("Rendered")
+
+_ROWS: Final = 128
+"""Rows of an image whose classes are found together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedCondition:
+    """One rendered view.
+
+    Args:
+        rgb: f32[3, H, W] in [0, 1], over the sky.
+        depth: f32[H, W], camera z in metres; NaN in the sky and where the scene is empty.
+        alpha: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the rest is sky.
+        semantics: u8[H, W] train ids, 255 = unknown.
+        certainty: f32[H, W] in [0, 1], how well photographs and LiDAR constrain what the pixel shows; at most alpha, so 0 in the sky.
+            None: unknown, for a scene fitted by a version that did not measure it.
+    """
+
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+    semantics: Tensor
+    certainty: Tensor | None
+
+
+def raster_of(model: SceneModel, backend: Backend = "auto", packed: bool = False) -> RasterConfig:
+    """How a fitted scene is drawn: as it was while it was fitted."""
+    return RasterConfig(backend=backend, near_m=NEAR_M, packed=packed, **model.facts.get(DRAWING, {}))
+
+
+def drawing_facts(config: DrawingConfig) -> dict[str, Any]:
+    """What a model notes of these settings: nothing if they are the usual ones."""
+    chosen, usual = asdict(config), asdict(DrawingConfig())
+    changed = {name: value for name, value in chosen.items() if name != "packed" and value != usual[name]}
+    return {DRAWING: changed} if changed else {}
+
+
+def check_drawing(config: FitConfig, device: torch.device) -> None:
+    """Refuse before the work what no step could draw.
+
+    Raises:
+        UsageError: settings that exclude each other, that the backend of this device lacks, or that give no gradients for what is to
+            be learnt.
+    """
+    wanted = config.drawing
+    backend = config.raster if config.raster != "auto" else "gsplat" if device.type == "cuda" else "cpu"
+    refuse_settings(backend, RasterConfig(backend=config.raster, near_m=NEAR_M, **asdict(wanted)))
+    if (wanted.projection, wanted.primitive) != ("linear", "ellipsoid") and config.densify.kind == "gradient":
+        raise UsageError("this way of drawing has no gradients of projected means, by which Gaussians are added",
+                         where="--drawing", got=f"{wanted.projection}, {wanted.primitive}", remedy="add --densify.kind mcmc")  # fmt: skip
+    if wanted.projection == "unscented" and config.appearance.cameras:
+        raise UsageError("unscented projection has no gradients of camera poses", where="--appearance.cameras",
+                         remedy="leave it out, or set --drawing.projection linear")  # fmt: skip
+
+COVERED = 0.5
+"""Opacity from which on a pixel is no sky."""
+
+
+@torch.no_grad()
+def render_view(
+    model: SceneModel, view: View, raster: RasterConfig, source: str = ""
+) -> Observation:
+    """Render one view of a fitted scene as an observation of kind "virtual", on the CPU.
+
+    Where coverage is below ``COVERED``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
+    sky has no depth. Confidence is the coverage (1 where the sky is a valid answer).
+    """
+    return _brought_back(_observed(model, rasterize(compose(model, view.time_s), view, raster), view, source))
+
+
+@torch.no_grad()
+def render_condition(
+    model: SceneModel, view: View, raster: RasterConfig | None = None
+) -> RenderedCondition:
+    """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``."""
+    gaussians, certainty = compose(model, view.time_s), model.certainty
+    if certainty is not None:
+        known = certainty.float()[:, None]
+        gaussians = replace(
+            gaussians, extra=known if gaussians.extra is None else torch.cat([gaussians.extra, known], 1)
+        )
+    render = rasterize(gaussians, view, raster or raster_of(model))
+    blended = None
+    if certainty is not None and render.extra is not None:
+        blended = torch.minimum(render.extra[-1].clamp_min(0), render.alpha[0])
+        render = replace(render, extra=render.extra[:-1] if len(render.extra) > 1 else None)
+    seen = _observed(model, render, view)
+    shape = render.alpha.shape[1:]
+    depth = render.alpha.new_full(shape, torch.nan) if seen.depth is None else seen.depth[0]
+    unknown = render.alpha.new_full(shape, palette.UNLABELLED, dtype=torch.uint8)
+    semantics = unknown if seen.semantics is None else seen.semantics.to(torch.uint8)
+    return _brought_back(RenderedCondition(seen.rgb, depth, render.alpha[0], semantics, blended))
+
+
+def _brought_back(result: Rendered) -> Rendered:
+    """The same with its tensors on the CPU: the one place where pictures leave the device."""
+    made: Any = result
+    tensors = {f.name: value for f in fields(made) if isinstance(value := getattr(made, f.name), Tensor)}
+    if all(value.device.type == "cpu" for value in tensors.values()):
+        return result
+    return replace(made, **{name: value.cpu() for name, value in tensors.items()})
+
+
+def _observed(model: SceneModel, render: Render, view: View, source: str = "") -> Observation:
+    rgb = composite_sky(model, view, render.rgb, render.alpha).clamp(0, 1)
+    covered = render.alpha >= COVERED
+    depth = torch.where(covered, render.depth, torch.nan)
+    semantics = None
+    if render.extra is not None:
+        rows = zip(render.extra.split(_ROWS, 1), render.alpha.split(_ROWS, 1), strict=True)  # no copy of all classes at once
+        channel = torch.cat([composite_semantics(model, extra, alpha).max(0).indices for extra, alpha in rows])
+        semantics = torch.tensor(model.classes).to(channel.device, non_blocking=True)[channel]
+        if model.sky is not None:
+            semantics = torch.where(covered[0], semantics, palette.ID["sky"])
+            depth = torch.where(semantics[None] == palette.ID["sky"], torch.nan, depth)
+    confidence = render.alpha if model.sky is None else torch.where(covered, render.alpha, 1 - render.alpha)
+    source = source or str(model.facts.get("method", "fit"))
+    return Observation(view, rgb, depth, semantics, confidence.clamp(0, 1), torch.ones_like(covered), "virtual", source)
+
+
+# renders of a fitted scene as the diffusion model's condition holds them ----------------------------------------------
+
+
+FAR_M = 1000.0
+"""Depth of the sky and of what the scene does not cover."""
+
+
+def render_planes(model: SceneModel, view: View) -> RenderPlanes:
+    """What a fitted scene, on any device, shows at a view: on the CPU, without the leading dimension. In the sky coverage and certainty
+    are 0; a scene fitted by a version that measured no certainty counts as half certain wherever it covers."""
+    seen = render_condition(model, view)
+    solid = torch.isfinite(seen.depth)
+    alpha = torch.where(solid, seen.alpha, 0.0)
+    certainty = 0.5 * alpha if seen.certainty is None else torch.where(solid, seen.certainty, 0.0).clamp(max=alpha)
+    depth = seen.depth.nan_to_num(FAR_M).clamp(max=FAR_M)
+    return RenderPlanes(seen.rgb, *(x.clamp(min=0)[None] for x in (depth, alpha, certainty)), seen.semantics[None])

@@ -1,0 +1,197 @@
+"""When a fit does what: learning rates, densification and rounds of box corrections as functions of the step.
+
+Steps count from 1 to the length of the run; a fit that goes on with a finished one begins in the middle (``gaussians/storage.py``).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mudg.base.errors import NumericsError
+from mudg.core.table import Table
+from mudg.gaussians.appearance import Appearance
+from mudg.gaussians.densify import DensifySettings, McmcSettings
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
+
+# finite ---------------------------------------------------------------------------------------------------------------
+#
+# Nothing that is not finite reaches the parameters: loss terms and gradients are checked before every step of the optimiser.
+#
+# On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that was sent there, so the numbers
+# of a whole step are gathered there and come back in one copy.
+
+
+Complaint = Callable[[float], None]
+"""Raises for a number that is not finite; returns where it only overflowed."""
+
+
+class FiniteCheck:
+    """The numbers of one step that must be finite, in the order in which they were computed.
+
+    Args:
+        step: for messages.
+        at_once: look at every number when it is added, not in ``refuse``.
+    """
+
+    def __init__(self, step: int, at_once: bool) -> None:
+        self._step = step
+        self._at_once = at_once
+        self._added: list[tuple[Tensor, Complaint]] = []
+
+    def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
+        """Add the loss terms of a view."""
+        self._add(
+            [
+                (value.detach(), functools.partial(_refuse_term, name, self._where(view)))
+                for name, value in terms.items()
+            ]
+        )
+
+    def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
+        """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there is."""
+        learnt = {"gaussians": (model.table, SCENE_REMEDY)}
+        learnt |= {owner: (table, SCENE_REMEDY) for owner, table in model.node_tables().items()}
+        learnt |= {f"appearance {group}": (table, VIEW_REMEDY) for group, table in appearance.tables.items()}
+        self._add([
+            (gradient.sum(), functools.partial(_refuse_gradient, table, gradient, f"{owner}.{name}, {self._where(view)}", remedy))
+            for owner, (table, remedy) in learnt.items() for name, gradient in table.gradients().items()
+        ])  # fmt: skip
+
+    def refuse(self) -> None:
+        """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been touched."""
+        added, self._added = self._added, []
+        if added:
+            numbers = torch.stack([number for number, _ in added]).tolist()
+            for number, (_, complain) in zip(numbers, added):
+                if not math.isfinite(number):
+                    complain(number)
+
+    def _where(self, view: str) -> str:
+        return f"view {view}, step {self._step}"
+
+    def _add(self, numbers: list[tuple[Tensor, Complaint]]) -> None:
+        self._added += numbers
+        if self._at_once:
+            self.refuse()
+
+
+SCENE_REMEDY = "the parameters are those of the step before; report the scene, or leave this view out"
+VIEW_REMEDY = "the parameters are those of the step before; leave this view out"
+
+
+def _refuse_term(name: str, where: str, number: float) -> None:
+    raise NumericsError(f"the loss term {name!r} is not finite", where=where, got=str(number),
+        remedy="check this view's image and labels; the parameters are those of the step before")  # fmt: skip
+
+
+def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, number: float) -> None:
+    count = int((~torch.isfinite(gradient)).sum())
+    if count:  # else the sum overflowed
+        table.clear_gradients()
+        raise NumericsError("a gradient is not finite", where=where, got=f"{count} values", remedy=remedy)
+
+
+# settings of short fits: good enough to learn from what a fit gets wrong, in a few seconds ----------------------------
+
+
+MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
+"""Gaussians at most, and the cubes of which each starts one, metres."""
+WIDTHS = 2
+"""Photographs are fitted at this many times the width of the clips that the renders are for."""
+
+
+def short_fit(iterations: int, clip_width_px: int, camera_width_px: int, seed: int, device: str = "cpu") -> FitConfig:
+    """A fit to recorded views alone, for renders in the conditions of clips `clip_width_px` wide."""
+    return FitConfig(
+        method="street_gaussians", iterations=iterations, width_px=min(WIDTHS * clip_width_px, camera_width_px), seed=seed,
+        device=device, preview_every=1_000_000, densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
+        start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M),
+    )  # fmt: skip
+
+
+# schedule -------------------------------------------------------------------------------------------------------------
+
+
+PUBLISHED_STEPS = 30_000
+FIELD_STEPS = 55_000
+"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises more than in proportion, within bounds: the field
+starts from nothing and has as far to go, and every time is seen by few of the steps."""
+LAST_DENSIFIED = 0.6
+"""Share of the run after which Gaussians are no longer added."""
+LAST_POSE_ROUND = 0.85
+
+
+def learning_rates(step: int, iterations: int) -> dict[str, float]:
+    """Learning rate of every column at a step (from 1).
+
+    Published rates belong to 30,000 steps. A shorter run takes larger steps, by the square root of the ratio and at most
+    4 times; positions decay to a hundredth over the run, scales and colours to a fifth.
+    """
+    boost = min(4.0, math.sqrt(max(1.0, PUBLISHED_STEPS / iterations)))
+    along = step / max(1, iterations)
+    decay, gentle = 0.01**along, 0.2**along
+    field = max(1.0, FIELD_STEPS / iterations) ** 1.5
+    return {
+        "means": 1.6e-4 * 10.0 * boost * decay,
+        "quats": 1e-3 * boost,
+        "log_scales": 5e-3 * boost * gentle,
+        "logits": 5e-2 * math.sqrt(boost),
+        "sh_dc": 2.5e-3 * boost * gentle,
+        "sh_rest": 1.25e-4 * boost * gentle,
+        "semantics": 1e-2 * boost,
+        "panorama": 1e-2 * gentle,
+        "deform": 1e-3 * boost * gentle,
+        "network": 1e-3 * gentle,
+        "embeddings": 1e-3 * gentle,
+        "planes": min(0.03, 1.6e-4 * field) * 0.1**along,
+        "plane_network": min(0.003, 1.6e-5 * field) * 0.1**along,
+        "curve": 1.6e-3 * 10.0 * boost * decay,
+        "trajectory": 1.6e-5 * 10.0 * boost * decay,
+        "tau": 8e-4 * boost * decay,
+        "log_beta": 2e-3 * boost,
+        "velocity": 1e-3 * 10.0 * boost,
+    }
+
+
+def appearance_rates(step: int, iterations: int) -> dict[str, float]:
+    """Learning rates of the corrections of appearance at a step (from 1)."""
+    gentle = 0.2 ** (step / max(1, iterations))
+    return {"affine": 2e-3 * gentle, "shift": 1e-3 * gentle, "turn": 1e-4 * gentle}
+
+
+def densify_schedule(config: FitConfig, last: float = LAST_DENSIFIED) -> DensifySettings | McmcSettings | None:
+    """The published schedules, scaled to the iterations; None without densification.
+
+    gradient: from 500, every 100, until ``last`` of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
+    """
+    total = config.iterations
+    every = max(10, min(100, total // 20))
+    start = max(every, min(500, total // 10))
+    if config.densify.kind == "mcmc":
+        return McmcSettings(start, int(0.8 * total), every, max_rows=config.densify.max_gaussians)
+    if config.densify.kind == "none":
+        return None
+    return DensifySettings(
+        start,
+        stop := int(last * total),
+        every,
+        max_rows=config.densify.max_gaussians,
+        reset_every=3000 if total >= 10_000 else 0,
+        late=stop // 2,
+    )
+
+
+def pose_round_due(config: FitConfig, step: int) -> bool:
+    """Whether boxes are corrected after a step."""
+    poses = config.poses
+    if not poses.learn or not poses.rounds:
+        return False
+    shares = np.linspace(poses.start, max(poses.start, LAST_POSE_ROUND), poses.rounds)
+    return step in {max(1, round(float(share) * config.iterations)) for share in shares}

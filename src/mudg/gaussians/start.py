@@ -1,0 +1,305 @@
+"""Starting values of a scene model: fused points become Gaussians, what LiDAR never reached is filled in, the sky is painted.
+
+What LiDAR does not reach in a street: facades above the topmost beam, and everything beyond its range. Both are filled from
+the recorded images: a pixel that is neither sky nor a dynamic object and has no point near it takes the depth of the surface of
+the same class below it in its column (walls, trees and poles stand upright, so their camera z hardly changes upwards); where
+there is none it is put on a far shell. This needs semantic labels; without them nothing is filled and the sky stands in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mudg.base import geometry, log, seeds
+from mudg.base.camera_colors import CameraColors
+from mudg.base.errors import InputError
+from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
+from mudg.base.types import FusedCloud, PointCloud, Scene
+from mudg.core.table import Table
+from mudg.gaussians.methods import METHODS
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode, StaticNode, object_node
+from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.views import StoredView, heads_of
+
+# starting values of Gaussians: points, thinned and coloured, become rows of the table ---------------------------------
+
+
+SH_C0: Final = 0.28209479177387814
+START_OPACITY: Final = 0.1
+
+
+def voxel_filter(xyz: NDArray[np.float32], size_m: NDArray[np.floating] | float) -> NDArray[np.int64]:
+    """Indices of one point per cube of side ``size_m`` (a number, or one per point, taken to powers of sqrt 2), sorted."""
+    if np.isscalar(size_m):
+        level, cell = np.zeros(len(xyz), np.int64), np.floor(xyz / float(size_m)).astype(np.int64)  # type: ignore[arg-type]
+    else:
+        level = np.round(2 * np.log2(np.asarray(size_m, np.float64))).astype(np.int64)
+        cell = np.floor(xyz / np.exp2(level / 2)[:, None]).astype(np.int64)
+    keys = np.column_stack([level, cell])
+    keys = keys - keys.min(0, initial=0)
+    spans = keys.max(0, initial=0) + 1
+    flat = ((keys[:, 0] * spans[1] + keys[:, 1]) * spans[2] + keys[:, 2]) * spans[3] + keys[:, 3]
+    return np.sort(np.unique(flat, return_index=True)[1])
+
+
+def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest_m: float = 1.5) -> NDArray[np.float32]:
+    """Root mean square distance to the three nearest other points, f32[N] metres, kept within bounds."""
+    if len(xyz) < 4:
+        return np.full(len(xyz), 0.1, np.float32)
+    distance, _ = cKDTree(xyz).query(xyz, k=4, workers=1)
+    return np.sqrt((distance[:, 1:] ** 2).mean(1)).clip(smallest_m, largest_m).astype(np.float32)
+
+
+def columns_from_points(
+    xyz: NDArray[np.float32], rgb: NDArray[np.uint8], semantics: NDArray[np.uint8] | None, classes: Sequence[int],
+    sh_degree: int, scale_m: NDArray[np.float32] | None = None,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known.
+
+    Args:
+        xyz: f32[N, 3] metres in the node's frame. rgb: u8[N, 3]. semantics: u8[N] train ids (255 = unknown) or None.
+        scale_m: f32[N]; default from the three nearest neighbours.
+    """
+    count = len(xyz)
+    scale = neighbour_scale(xyz) if scale_m is None else scale_m
+    logits = np.zeros((count, len(classes)), np.float32)
+    if semantics is not None:
+        for channel, train_id in enumerate(classes):
+            logits[semantics == train_id, channel] = 3.0
+    quats = np.zeros((count, 4), np.float32)
+    quats[:, 0] = 1.0
+    columns = {
+        "means": torch.from_numpy(np.array(xyz, np.float32)),
+        "quats": torch.from_numpy(quats),
+        "log_scales": torch.from_numpy(np.log(scale))[:, None].repeat(1, 3),
+        "logits": torch.full((count,), float(np.log(START_OPACITY / (1 - START_OPACITY)))),
+        "sh_dc": torch.from_numpy((rgb.astype(np.float32) / 255 - 0.5) / SH_C0)[:, None],
+        "semantics": torch.from_numpy(logits),
+    }
+    if sh_degree > 0:
+        columns["sh_rest"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)
+    return columns
+
+
+def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one colour."""
+    axis = np.linspace(-0.5, 0.5, 12)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    surface = grid[(np.abs(grid) > 0.5 - 1e-9).any(1)]
+    xyz = (surface * 0.9 * np.asarray(size_m)).astype(np.float32)
+    return xyz, np.broadcast_to(np.asarray(rgb, np.uint8), (len(xyz), 3)).copy()
+
+
+# start ----------------------------------------------------------------------------------------------------------------
+
+
+UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
+GROUND_IDS = tuple(ID[n] for n in ("road", "sidewalk", "terrain"))
+FILL_CELL_PX = 8
+FILL_FRAMES = 30
+FAR_M = 150.0
+"""Depth at which pixels start that are neither sky nor within LiDAR range."""
+SKY_ROWS = 192
+FEWEST_OBJECT_POINTS = 150
+MIRROR_APART_M = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class StartPoints:
+    """Points that become Gaussians, in the frame of their node: xyz f32[N, 3] and scale f32[N] in metres, rgb u8[N, 3], train ids u8[N]."""
+
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    semantics: NDArray[np.uint8]
+    scale_m: NDArray[np.float32]
+
+    @classmethod
+    def joined(cls, parts: Sequence[StartPoints]) -> StartPoints:
+        """All points of the parts, in order."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def __getitem__(self, rows: NDArray[np.integer] | slice) -> StartPoints:
+        """Copies of the points at these indices."""
+        rows = np.arange(len(self))[rows] if isinstance(rows, slice) else rows
+        return StartPoints(self.xyz[rows], self.rgb[rows], self.semantics[rows], self.scale_m[rows])
+
+    def columns(self, classes: tuple[int, ...], sh_degree: int) -> dict[str, torch.Tensor]:
+        """Rows of the table of Gaussians."""
+        return columns_from_points(self.xyz, self.rgb, self.semantics, classes, sh_degree, scale_m=self.scale_m)
+
+
+def start_model(
+    scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+) -> SceneModel:
+    """Build the scene model that the fit starts from.
+
+    Raises:
+        InputError: the fused cloud has no points at all.
+    """
+    if len(fused.static) == 0:
+        raise InputError("the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene")
+    kinds = METHODS[config.method].nodes
+    blocks = [_static_columns(fused, views, classes, config)]
+    nodes: list[StaticNode | RigidNode] = [StaticNode()]
+    if "objects" in kinds:
+        share = config.start.gaussians // max(1, len(fused.objects))
+        for track_id, cloud in sorted(fused.objects.items()):
+            node = object_node(scene.track(track_id), config.poses.learn, config.objects.deformable)
+            blocks.append(_object_columns(node, cloud, classes, config, min(share, 8000)))
+            nodes.append(node)
+    columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
+    owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
+    sky = painted_sky(views, fused.colors) if "sky" in kinds else None
+    static = len(blocks[0]["means"])
+    log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
+    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
+
+
+def _static_columns(
+    fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
+) -> Mapping[str, torch.Tensor]:
+    cloud = fused.static
+    centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
+    rows = thinned(cloud.xyz, centers, config)
+    points = StartPoints(cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows], neighbour_scale(cloud.xyz[rows]))
+    filled = fill_unreached(views, points.xyz, classes, fused.colors)
+    return (points if filled is None else StartPoints.joined([points, filled])).columns(classes, config.sh_degree)
+
+
+def _labels(cloud: PointCloud) -> NDArray[np.uint8]:
+    return np.full(len(cloud), UNLABELLED, np.uint8) if cloud.semantics is None else cloud.semantics
+
+
+def thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
+    """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted number."""
+    distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
+    size = config.start.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
+    for _ in range(12):
+        rows = voxel_filter(xyz, size)
+        if len(rows) <= config.start.gaussians:
+            return rows
+        size = size * np.clip((len(rows) / config.start.gaussians) ** 0.5, 1.08, 2.0)
+    return rows[np.sort(seeds.numpy_rng(config.seed, 0, "thin").permutation(len(rows))[: config.start.gaussians])]
+
+
+def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Points reflected about y = 0 of the box, where no measured point is within ``apart_m``: xyz f32[M, 3] and their sources."""
+    if len(xyz) == 0:
+        return xyz, np.zeros(0, np.int64)
+    flipped = xyz * np.array([1, -1, 1], np.float32)
+    distance, _ = cKDTree(xyz).query(flipped, k=1, workers=1)
+    source = np.flatnonzero(distance > apart_m)
+    return flipped[source], source
+
+
+def _object_columns(
+    node: RigidNode, cloud: PointCloud, classes: tuple[int, ...], config: FitConfig, most: int
+) -> Mapping[str, torch.Tensor]:
+    rows = voxel_filter(cloud.xyz, 0.06)
+    rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
+    xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]
+    if config.objects.mirror_start and node.symmetric:
+        other, source = mirrored_points(xyz)
+        xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
+        semantics = np.concatenate([semantics, semantics[source]])
+    if len(rows) < FEWEST_OBJECT_POINTS:
+        color = rgb.mean(0) if len(rgb) else np.array([127, 127, 127])
+        grid_xyz, grid_rgb = box_grid(node.size_m, color)
+        commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
+        xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
+        semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
+    return StartPoints(xyz, rgb, semantics, neighbour_scale(xyz, 0.02, 0.3)).columns(classes, config.sh_degree)
+
+
+# ---- beyond LiDAR ---------------------------------------------------------------------------------------------------
+
+
+def fill_unreached(
+    views: Sequence[StoredView], xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
+) -> StartPoints | None:
+    """Points for what is visible but has no LiDAR; see the module's text. None without labels."""
+    labelled = [index for index, head in enumerate(heads_of(views)) if head.labelled]
+    if not labelled or not classes:
+        return None
+    chosen = labelled[:: max(1, len(labelled) // FILL_FRAMES)]
+    points = StartPoints.joined([_fill_view(views[index], xyz, classes, cameras) for index in chosen])
+    return points[voxel_filter(points.xyz, np.maximum(points.scale_m * 2.0, 0.05))] if len(points) else None
+
+
+def _fill_view(
+    stored: StoredView, xyz: NDArray[np.float32], classes: tuple[int, ...], cameras: CameraColors
+) -> StartPoints:
+    view, cell = stored.view, FILL_CELL_PX
+    rows, columns = view.camera.height // cell, view.camera.width // cell
+    center_row = (np.arange(rows) * cell + cell // 2)[:, None]
+    center_column = (np.arange(columns) * cell + cell // 2)[None, :]
+    train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
+    channel = stored.channels[center_row, center_column]  # type: ignore[index]
+    label = train_ids[np.minimum(channel, len(classes))]
+    depth = _cell_depth(stored, xyz, rows, columns)
+    covered = np.isfinite(depth)
+    wanted = ~covered & np.isin(label, [i for i in range(19) if i not in (*DYNAMIC_IDS, *GROUND_IDS, ID["sky"])])
+    if stored.mask is not None:
+        wanted &= stored.mask[center_row, center_column]
+    guess = np.full((rows, columns), FAR_M)
+    below = np.full((256, columns), np.inf)  # per class: depth of the last covered cell below, in this column
+    every = np.arange(columns)
+    for row in range(rows - 1, -1, -1):
+        known = covered[row] & np.isin(label[row], UPRIGHT_IDS)
+        below[label[row, known], every[known]] = depth[row, known]
+        surface = below[label[row], every]
+        guess[row] = np.where(np.isfinite(surface), surface, FAR_M)
+    row, column = wanted.nonzero()
+    uv = np.stack([column * cell + cell / 2, row * cell + cell / 2], 1)
+    z = guess[row, column]
+    color = cameras.bytes_to_common(view.camera.name, stored.rgb[row * cell + cell // 2, column * cell + cell // 2])
+    points = geometry.unproject(view, uv, z).astype(np.float32)
+    return StartPoints(points, color, label[row, column], (0.5 * cell * z / view.camera.fx).astype(np.float32))
+
+
+def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
+    """Nearest depth of the points in each cell of the image; infinity where there is none. A cell beside a covered one in
+    its row counts as covered (LiDAR lines are sparse)."""
+    uv, z = geometry.project(stored.view, xyz)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 1.0) & (uv[:, 0] >= 0) & (uv[:, 0] < columns * FILL_CELL_PX) & (uv[:, 1] >= 0) & (uv[:, 1] < rows * FILL_CELL_PX)
+    column, row = (uv[inside, 0] // FILL_CELL_PX).astype(int), (uv[inside, 1] // FILL_CELL_PX).astype(int)
+    depth = np.full((rows, columns), np.inf)
+    np.minimum.at(depth, (row, column), z[inside])
+    padded = np.pad(depth, ((0, 0), (1, 1)), constant_values=np.inf)
+    return np.where(np.isfinite(depth), depth, np.minimum(padded[:, :-2], padded[:, 2:]))
+
+
+def painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
+    """A sky that starts with the mean recorded colour per direction, in common colours."""
+    sky = SkyNode.uniform(SKY_ROWS)
+    sky.fill(_sky_pixels(views, cameras))
+    return sky
+
+
+def _sky_pixels(
+    views: Sequence[StoredView], cameras: CameraColors
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]:
+    """Directions and common colours of every second row and column of the sky, view by view."""
+    for stored in views:
+        if stored.sky is None:
+            continue
+        camera = stored.view.camera
+        row, column = stored.sky[::2, ::2].nonzero()
+        row, column = row * 2, column * 2
+        rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
+        rgb = cameras.bytes_to_common(camera.name, stored.rgb[row, column])
+        yield rays @ stored.view.world_from_cam[:3, :3].T, rgb.astype(np.float32) / 255

@@ -1,0 +1,673 @@
+"""The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations.
+
+Everything is stored as bytes (8-bit colour and labels) and becomes tensors when a step asks for one view. Which view a step
+gets is a function of (run seed, step) alone. Where the bytes lie, in memory or in a file, is decided in ``views.py``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import threading
+from abc import abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg import native
+from mudg.base import geometry, log, seeds
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.palette import ID, UNLABELLED
+from mudg.base.processes import GIB, computed_ahead
+from mudg.base.scratch import ScratchFile
+from mudg.base.types import Frame, FusedCloud, ObservationKind, Scene, Sweep, Track, View
+from mudg.core.fusion import largest_beam_gap
+from mudg.core.pictures import resize_area, resize_nearest
+from mudg.core.project import RULES as HIDING_RULES
+from mudg.core.project import ProjectConfig, project_sparse, visible_depth
+from mudg.networks.featnets import WHOLE_PIXELS
+from mudg.scene.labels import read_label
+from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
+from mudg.scene.read import read_image, read_points
+
+CPU = torch.device("cpu")
+MAX_LIDAR_M = 100.0
+NEAREST_SWEEP_S = 0.1
+READERS = 8
+"""Threads that read views, at most; each holds one, and two wait for each."""
+SWEEPS_PER_SENSOR = 6
+
+
+@dataclass(frozen=True)
+class LidarPixels:
+    """Sparse LiDAR depth of one view: flat pixel indices i64[M] and depths f32[M] in metres."""
+
+    pixel: Tensor
+    depth_m: Tensor
+
+    def to(self, device: torch.device) -> LidarPixels:
+        """The same pixels on a device."""
+        return LidarPixels(self.pixel.to(device, non_blocking=True), self.depth_m.to(device, non_blocking=True))
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One view as tensors, ready for a step.
+
+    Args:
+        name: e.g. ``front/000012`` or ``front_shift+2.0/000003``, for messages.
+        kind: recorded or virtual.
+        rgb: f32[3, H, W] in [0, 1].
+        channels: i64[H, W], numbers of the model's class channels (255 = unlabelled), or None.
+        confidence: f32[1, H, W] in [0, 1]: of all that a virtual view shows, of the labels alone for a recorded one.
+        mask: bool[1, H, W], pixels that may be used at all.
+        sky: bool[1, H, W] or None if unknown.
+        depth: f32[1, H, W] metres of a virtual view (NaN = none), or None.
+        lidar: or None.
+    """
+
+    name: str
+    view: View
+    kind: ObservationKind
+    rgb: Tensor
+    channels: Tensor | None
+    confidence: Tensor
+    mask: Tensor
+    sky: Tensor | None
+    depth: Tensor | None
+    lidar: LidarPixels | None
+
+
+@dataclass(frozen=True)
+class ViewHead:
+    """What is known of a view without its pixels; ``labelled``: whether it has class channels."""
+
+    name: str
+    view: View
+    kind: ObservationKind
+    labelled: bool
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence u8[H, W] (255 =
+    1). None where there is none; no mask: all pixels, no confidence: 1."""
+
+    name: str
+    view: View
+    kind: ObservationKind
+    rgb: NDArray[np.uint8]
+    channels: NDArray[np.uint8] | None = None
+    sky: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_] | None = None
+    lidar: LidarPixels | None = None
+    depth: NDArray[np.float32] | None = None
+    confidence: NDArray[np.uint8] | None = None
+
+    @property
+    def head(self) -> ViewHead:
+        """The view without its pixels."""
+        return ViewHead(self.name, self.view, self.kind, self.channels is not None)
+
+    def as_tensors(self, device: torch.device = CPU) -> TrainView:
+        """The view for a step, on a device. The bytes travel and grow there: a fifth of what the tensors take."""
+
+        def sent(array: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(array).to(device, non_blocking=True)
+
+        everywhere = torch.ones(1, *self.rgb.shape[:2], device=device)
+        return TrainView(
+            name=self.name,
+            view=self.view,
+            kind=self.kind,
+            rgb=sent(self.rgb).permute(2, 0, 1).contiguous().float().div_(255),
+            channels=None if self.channels is None else sent(self.channels).long(),
+            confidence=everywhere if self.confidence is None else sent(self.confidence)[None].float().div_(255),
+            mask=everywhere.bool() if self.mask is None else sent(self.mask)[None],
+            sky=None if self.sky is None else sent(self.sky)[None],
+            depth=None if self.depth is None else sent(self.depth)[None],
+            lidar=None if self.lidar is None else self.lidar.to(device),
+        )
+
+
+class FiledViews(Sequence[StoredView]):
+    """Views that do not lie in memory: asking for one reads it."""
+
+    heads: Sequence[ViewHead]
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give the space back; nothing can be read any more."""
+
+
+def heads_of(views: Sequence[StoredView]) -> Sequence[ViewHead]:
+    """All views without their pixels; nothing is read."""
+    return views.heads if isinstance(views, FiledViews) else [view.head for view in views]
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """All views of a fit. ``virtual`` may be empty."""
+
+    recorded: Sequence[StoredView]
+    virtual: Sequence[StoredView]
+
+    @property
+    def filed(self) -> bool:
+        """Whether some views do not lie in memory."""
+        return any(isinstance(views, FiledViews) for views in (self.recorded, self.virtual))
+
+    def close(self) -> None:
+        """Give back the space of views that do not lie in memory."""
+        for views in (self.recorded, self.virtual):
+            if isinstance(views, FiledViews):
+                views.close()
+
+    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[StoredView, ...]:
+        """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
+
+        Recorded views come in a fresh random order per round, so that every one is seen equally often.
+
+        Args:
+            beside: the virtual view comes after the recorded one, not in its place.
+        """
+        generator = seeds.numpy_rng(run_seed, step, "view")
+        if self.virtual and generator.random() < virtual_probability:
+            drawn = self.virtual[int(generator.integers(len(self.virtual)))]
+            return (self._recorded_of(run_seed, step), drawn) if beside else (drawn,)
+        return (self._recorded_of(run_seed, step),)
+
+    def _recorded_of(self, run_seed: int, step: int) -> StoredView:
+        """The recorded view of a step."""
+        turn, place = divmod(step, len(self.recorded))
+        order = seeds.numpy_rng(run_seed, turn, "recorded order").permutation(len(self.recorded))
+        return self.recorded[int(order[place])]
+
+
+# ---- recorded ----------------------------------------------------------------------------------------------------
+
+
+def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
+    """Training frames of the named cameras (empty = all).
+
+    Raises:
+        UsageError: an unknown camera, or no training frame at all.
+    """
+    for name in cameras:
+        if name not in scene.cameras:
+            raise UsageError(f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras))
+    frames = tuple(f for f in scene.frames_in("train") if not cameras or f.view.camera.name in cameras)
+    if not frames:
+        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0")
+    return frames
+
+
+def classes_of(scene: Scene, frames: Sequence[Frame], virtual: Mapping[str, ObservationSet]) -> tuple[int, ...]:
+    """Train ids that occur in the labels of the frames and in virtual views (a sample of both); sky always included.
+
+    Empty when nothing is labelled.
+    """
+    found: set[int] = set()
+    labelled = [frame for frame in frames if "semantics" in frame.labels]
+    for frame in labelled[:: max(1, len(labelled) // 24)]:
+        found |= set(np.unique(read_label(scene, frame, "semantics")).tolist())
+    for observations in virtual.values():
+        for index in range(0, len(observations), 6):
+            found |= set(np.unique(observations.arrays(index).get("semantics", UNLABELLED)).tolist())
+    found -= {UNLABELLED}
+    return tuple(sorted(found | {ID["sky"]})) if found else ()
+
+
+LoadedViews = Generator[tuple[int, StoredView], None, None]
+"""Views with their places among all, in any order."""
+
+
+def load_recorded(
+    scene: Scene, frames: Sequence[Frame], classes: Sequence[int], width_px: int, with_lidar: bool
+) -> LoadedViews:
+    """Read frames, labels and LiDAR depths, resized to ``width_px`` (0 = as recorded).
+
+    Several threads read, in the order of time, so that all cameras need a sweep at once. Frames whose time is further than 0.1 s from
+    every sweep get no LiDAR depth; how many is said once.
+    """
+    points = _SweepCache(scene)
+
+    def read(frame: Frame) -> StoredView:
+        view = resized_view(frame.view, width_px)
+        size = (view.camera.height, view.camera.width)
+        labels = {
+            name: resize_nearest(read_label(scene, frame, name), *size) if name in frame.labels else None
+            for name in ("semantics", "sky", "ego", "semantics_confidence")
+        }
+        confidence = labels["semantics_confidence"]
+        semantics = labels["semantics"]
+        sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
+        return StoredView(
+            frame.id, view, "recorded", resize_area(read_image(scene, frame), *size[::-1]),
+            None if semantics is None or not classes else to_channels(semantics, classes), sky,
+            None if labels["ego"] is None else ~labels["ego"].astype(bool), points.pixels_of(view) if with_lidar else None,
+            confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
+        )  # fmt: skip
+
+    order = sorted(range(len(frames)), key=lambda index: frames[index].view.time_s)
+    without_lidar = 0
+    for index, stored in _read_by_threads(order, lambda index: read(frames[index]), "reading frames"):
+        without_lidar += stored.lidar is None
+        yield index, stored
+    if with_lidar and without_lidar:
+        log.warn(f"{without_lidar} of {len(frames)} frames have no LiDAR sweep within {NEAREST_SWEEP_S} s: no depth there")
+
+
+def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], doing: str) -> LoadedViews:
+    """``read`` of each of these numbers, with progress."""
+    with native.one_thread():
+        views = computed_ahead(lambda turn: read(order[turn]), len(order), min(native.default_threads(), READERS))
+        for turn, stored in enumerate(log.progress(views, len(order), doing)):
+            yield order[turn], stored
+
+
+def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
+    """The sets of virtual observations in some folders, of all trajectories or of one, by name; only their indices are read.
+
+    Raises:
+        InputError: a folder has none, two have sets of one name, or one of them holds recorded views.
+    """
+    sets: dict[str, ObservationSet] = {}
+    for path in folders:
+        found = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
+        if not found:
+            raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
+        if twice := sorted(set(found) & set(sets)):
+            raise InputError("two folders hold virtual views of the same name", where=str(path), got=", ".join(twice[:4]),
+                             remedy="give one of them")  # fmt: skip
+        sets |= found
+    for found in sets.values():
+        if found.kind == "recorded":
+            raise InputError("recorded views among the virtual ones: held-out views must not be trained on", where=str(found.path),
+                             expected="views of kind virtual", got=f"kind recorded, source {found.source}",
+                             remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
+    return sets
+
+
+def load_virtual(
+    sets: Mapping[str, ObservationSet], classes: Sequence[int], measured: Callable[[View], LidarPixels] | None = None
+) -> LoadedViews:
+    """All observations of these sets, with the sparse depth that ``measured`` gives for a view."""
+    every = [(name, observations, index) for name, observations in sets.items() for index in range(len(observations))]
+
+    def read(place: int) -> StoredView:
+        name, observations, index = every[place]
+        view, arrays = observations.views[index], observations.arrays(index)
+        semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
+        return StoredView(
+            f"{name}/{index:06d}", view, "virtual", observations.rgb_u8(index).copy(),
+            None if semantics is None or not classes else to_channels(semantics, classes),
+            None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool),
+            None if measured is None else measured(view), arrays["depth"].copy() if "depth" in arrays else None,
+            (confidence * 255).round().astype(np.uint8),
+        )  # fmt: skip
+
+    yield from _read_by_threads(range(len(every)), read, "reading virtual views")
+
+
+def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
+    """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are then.
+
+    Points behind others are left out as in the diffusion model's condition (``ConditionRules``).
+    """
+    drawn = ProjectConfig(near_m=1.0, far_m=MAX_LIDAR_M, occluder_m=0.2)
+
+    def measured(view: View) -> LidarPixels:
+        seen = project_sparse(cloud, tracks, view, drawn, hide=True)
+        pixel = seen.valid.reshape(-1).nonzero()[:, 0]
+        return LidarPixels(pixel, seen.depth.reshape(-1)[pixel].contiguous())
+
+    return measured
+
+
+def to_channels(train_ids: NDArray[np.integer], classes: Sequence[int]) -> NDArray[np.uint8]:
+    """Train ids to channel numbers of ``classes``; others become 255."""
+    lookup = np.full(256, UNLABELLED, np.uint8)
+    lookup[list(classes)] = np.arange(len(classes), dtype=np.uint8)
+    return lookup[train_ids.astype(np.uint8)]
+
+
+def resized_view(view: View, width_px: int) -> View:
+    """The view on a grid of this width, aspect kept (0 = unchanged)."""
+    camera = view.camera
+    if width_px in (0, camera.width):
+        return view
+    return view.resized(width_px, max(1, round(camera.height * width_px / camera.width)))
+
+
+# ---- LiDAR depth of a recorded view ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _WorldSweep:
+    """World points f32[N, 3] of a sweep, their times after it f32[N] in seconds, and the largest angle between its beams."""
+
+    xyz: NDArray[np.float32]
+    dt_s: NDArray[np.float32]
+    gap_deg: float
+
+
+class _SweepCache:
+    """World points of the sweeps nearest in time; several cameras share a sweep, and the last few are kept. Any thread may ask."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._read: OrderedDict[str, _WorldSweep] = OrderedDict()
+        self._lock = threading.Lock()
+        self._most = SWEEPS_PER_SENSOR * len({sweep.sensor for sweep in scene.sweeps})
+
+    def pixels_of(self, view: View) -> LidarPixels | None:
+        """Depths of the nearest sweep of every sensor as seen by the view; None if no sweep is near in time."""
+        clouds, gap_deg = [], 0.0
+        for sensor in dict.fromkeys(sweep.sensor for sweep in self._scene.sweeps):
+            sweeps = [sweep for sweep in self._scene.sweeps if sweep.sensor == sensor]
+            nearest = min(sweeps, key=lambda sweep: abs(sweep.time_s - view.time_s))
+            if abs(nearest.time_s - view.time_s) <= NEAREST_SWEEP_S:
+                found = self._world(nearest)
+                clouds.append(self._points_at(found, nearest, view.time_s))
+                gap_deg = max(gap_deg, found.gap_deg)
+        return lidar_pixels(view, np.concatenate(clouds), gap_deg) if clouds else None
+
+    def _world(self, sweep: Sweep) -> _WorldSweep:
+        with self._lock:
+            found = self._read.pop(sweep.id, None)
+            if found is None:
+                points = read_points(self._scene, sweep)
+                world = geometry.transform_points(sweep.world_from_lidar, points.xyz)
+                found = _WorldSweep(world, points.dt_s, largest_beam_gap(points.xyz))
+            self._read[sweep.id] = found
+            while len(self._read) > self._most:
+                self._read.popitem(last=False)
+        return found
+
+    def _points_at(self, found: _WorldSweep, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
+        """World points of a sweep, the points of every tracked box carried from when they were measured to ``time_s``."""
+        world, dt_s = found.xyz, found.dt_s
+        moved = world.copy()
+        for track in self._scene.tracks:
+            then, soon, now = track.pose_at(sweep.time_s), track.pose_at(sweep.time_s + 0.05), track.pose_at(time_s)
+            if then is None or now is None:
+                continue
+            velocity = np.zeros(3) if soon is None else (soon[:3, 3] - then[:3, 3]) / 0.05
+            if np.abs(velocity).max() < 0.01 and np.abs(now - then).max() < 0.01:
+                continue
+            near = _within(world, then[:3, 3].astype(np.float32), float(np.linalg.norm(track.size_m)) + 2.0)
+            at_sweep = world[near] - dt_s[near, None] * velocity.astype(np.float32)
+            local = geometry.transform_points(geometry.invert(then), at_sweep)
+            inside = (np.abs(local) < track.size_m / 2 + 0.1).all(1)
+            moved[near[inside]] = geometry.transform_points(now, local[inside])
+        return moved
+
+
+def _within(xyz: NDArray[np.float32], center: NDArray[np.float32], reach_m: float) -> NDArray[np.int64]:
+    """Indices of the points in the axis-aligned cube around ``center``; axis by axis, so that most points cost one test."""
+    near = np.flatnonzero(np.abs(xyz[:, 0] - center[0]) < reach_m)
+    for axis in (1, 2):
+        near = near[np.abs(xyz[near, axis] - center[axis]) < reach_m]
+    return near
+
+
+def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> LidarPixels:
+    """Depth of the points that the camera sees (``core.visible``); ``gap_deg``: largest angle between neighbouring beams."""
+    depth = visible_depth(view, xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M).reshape(-1)
+    pixel = np.flatnonzero(np.isfinite(depth))
+    return LidarPixels(torch.from_numpy(pixel), torch.from_numpy(depth[pixel]))
+
+
+# kept -----------------------------------------------------------------------------------------------------------------
+#
+# Where the views of a fit lie: small sets in memory, large ones in a scratch file, read ahead of the steps that need them.
+#
+# Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11 GiB, 1,000 virtual
+# ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder of the fit, plane by plane as they
+# are (masks in bits), so that a view costs one read and no decoding, and what a step gets is the same to the bit. The system keeps as
+# much of the file in memory as it can spare. Which views a step gets is a function of the step, so threads read those of the next steps
+# beforehand.
+
+
+IN_MEMORY_BYTES = GIB
+"""Decoded views of up to this size stay in memory."""
+AHEAD_THREADS = 2
+"""Threads that read the views of later steps; each has two steps waiting."""
+LIDAR_SHARE = 0.05
+"""Assumed share of pixels with LiDAR, for the size of views that are not read yet."""
+_PLANES = ("depth", "rgb", "channels", "confidence", "sky", "mask")
+"""Depth first, so that it lies at a multiple of its element's size."""
+
+
+# ---- how much there is -----------------------------------------------------------------------------------------------
+
+
+def recorded_bytes(frames: Sequence[Frame], width_px: int) -> int:
+    """Bytes that the frames need when they are decoded, about."""
+    total = 0.0
+    for frame in frames:
+        camera = resized_view(frame.view, width_px).camera
+        has = frame.labels
+        planes = (
+            3
+            + ("semantics" in has)
+            + ("sky" in has or "semantics" in has)
+            + ("ego" in has)
+            + ("semantics_confidence" in has)
+        )
+        total += camera.width * camera.height * (planes + 12 * LIDAR_SHARE)
+    return int(total)
+
+
+def virtual_bytes(sets: Mapping[str, ObservationSet]) -> int:
+    """Bytes that these observations need when they are decoded, about."""
+    total = 0.0
+    for found in sets.values():
+        for view, depth, semantics in zip(found.views, found.has_depth, found.has_semantics):
+            total += view.camera.width * view.camera.height * (5 + 4 * depth + 2 * semantics + 12 * LIDAR_SHARE)
+    return int(total)
+
+
+def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
+    """Where ``count`` views of ``needed`` bytes are to be kept: in a file in this folder, or None: in memory. Says which.
+
+    Raises:
+        ResourceError: the disk has less room than the file needs.
+    """
+    if needed <= IN_MEMORY_BYTES:
+        return None
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise ResourceError("the disk has too little room for the decoded views", where=str(folder),
+            expected=f"{needed / GIB:.1f} GiB free for {count} views while the fit runs", got=f"{free / GIB:.1f} GiB",
+            remedy="free disk space, choose --out on another disk, or lower --width-px")  # fmt: skip
+    log.info(
+        f"views: {count}, {needed / GIB:.1f} GiB decoded: kept in a scratch file in {folder}, gone when the fit ends"
+    )
+    return folder
+
+
+# ---- a file of views -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """Where a view lies: its head, the first byte, its planes (name, type, shape) in order, the number of LiDAR pixels (None: none)."""
+
+    head: ViewHead
+    begins: int
+    size: int
+    planes: tuple[tuple[str, np.dtype[Any], tuple[int, ...]], ...]
+    lidar: int | None
+
+
+class ViewFile(FiledViews):
+    """Views in a scratch file. Filled once; then any thread may read."""
+
+    def __init__(self, folder: Path, count: int) -> None:
+        self._file = ScratchFile(folder)
+        self._slots: list[_Slot | None] = [None] * count
+
+    def put(self, index: int, stored: StoredView) -> None:
+        """Write a view to its place."""
+        planes = [(name, array) for name in _PLANES if (array := getattr(stored, name)) is not None]
+        parts: list[NDArray[Any]] = []
+        if stored.lidar is not None:
+            parts += [stored.lidar.depth_m.numpy(), stored.lidar.pixel.numpy().astype(np.int32)]
+        parts += [np.packbits(array) if array.dtype == bool else array for _, array in planes]
+        content = np.concatenate([np.ascontiguousarray(part).reshape(-1).view(np.uint8) for part in parts])
+        lidar = None if stored.lidar is None else len(stored.lidar.pixel)
+        forms = tuple((name, array.dtype, array.shape) for name, array in planes)
+        self._slots[index] = _Slot(stored.head, self._file.append(content), len(content), forms, lidar)
+
+    def _slot(self, index: int) -> _Slot:
+        found = self._slots[index]
+        if found is None:
+            raise IndexError(f"view {index} was never written")
+        return found
+
+    @property
+    def heads(self) -> Sequence[ViewHead]:  # type: ignore[override]
+        """All views without their pixels."""
+        return [self._slot(index).head for index in range(len(self))]
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    @overload
+    def __getitem__(self, index: int) -> StoredView: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[StoredView]: ...
+    def __getitem__(self, index: int | slice) -> StoredView | Sequence[StoredView]:
+        if isinstance(index, slice):
+            raise TypeError("views in a file are read one at a time")
+        slot = self._slot(index)
+        content, at, lidar = self._file.read(slot.begins, slot.size), 0, None
+        if slot.lidar is not None:
+            ends = 4 * slot.lidar, 8 * slot.lidar
+            pixel = torch.from_numpy(content[ends[0] : ends[1]].view(np.int32).astype(np.int64))
+            at, lidar = ends[1], LidarPixels(pixel, torch.from_numpy(content[: ends[0]].view(np.float32)))
+        planes: dict[str, NDArray[Any]] = {}
+        for name, kind, shape in slot.planes:
+            pixels = math.prod(shape)
+            size = -(-pixels // 8) if kind.kind == "b" else pixels * kind.itemsize
+            part, at = content[at : at + size], at + size
+            planes[name] = (np.unpackbits(part, count=pixels) if kind.kind == "b" else part).view(kind).reshape(shape)
+        return StoredView(slot.head.name, slot.head.view, slot.head.kind, lidar=lidar, **planes)
+
+    def __iter__(self) -> Iterator[StoredView]:
+        for index in range(len(self)):
+            yield self[index]
+
+    def close(self) -> None:
+        """Give the space back; nothing can be read any more."""
+        self._file.close()
+
+
+def keep(loaded: LoadedViews, count: int, folder: Path | None) -> Sequence[StoredView]:
+    """The views in their places: in a scratch file in ``folder``, or in memory."""
+    with contextlib.closing(loaded) as pairs:
+        if folder is None:
+            places = dict(pairs)
+            return tuple(places[index] for index in range(count))
+        filed = ViewFile(folder, count)
+        try:
+            for index, stored in pairs:
+                filed.put(index, stored)
+        except BaseException:
+            filed.close()
+            raise
+        return filed
+
+
+# ---- views of later steps --------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def chosen_ahead(
+    views: ViewSet, choose: Callable[[int], tuple[StoredView, ...]], steps: range, device: torch.device = CPU
+) -> Iterator[Iterator[tuple[TrainView, ...]]]:
+    """The views that ``choose`` gives for each of these steps, as tensors on a device.
+
+    Where views lie in a file, threads read those of a few steps beforehand; they end with the block. What goes wrong in a thread is
+    raised at its step. Tensors are made by the caller's thread: in another one, every large allocation costs its page faults anew.
+    """
+    chosen: Generator[tuple[StoredView, ...], None, None]
+    if views.filed:
+        chosen = computed_ahead(lambda turn: choose(steps[turn]), len(steps), AHEAD_THREADS)
+    else:
+        chosen = (choose(step) for step in steps)
+    with contextlib.closing(chosen):
+        yield (tuple(view.as_tensors(device) for view in found) for found in chosen)
+
+
+# halved ---------------------------------------------------------------------------------------------------------------
+#
+# Virtual views at half their size, for the steps of a fit that need no more.
+#
+# Their finest structure is blurred by the diffusion model and teaches a scene little (docs/supervision.md), and a step costs about as
+# much
+# per pixel as it costs per Gaussian.
+
+
+LEAST_PX: Final = 96
+"""No side of a halved view is shorter: smaller views stay as they are."""
+
+
+class HalvedViews:
+    """Gives the steps up to ``until`` virtual views at half their size; of views above ``WHOLE_PIXELS`` all steps, for want of memory.
+
+    Args:
+        until: 0 leaves every view as it is.
+        keep: halved views stay in memory, a quarter of what the views themselves take.
+    """
+
+    def __init__(self, until: float, keep: bool) -> None:
+        self._until = until
+        self._kept: dict[str, StoredView] | None = {} if keep else None
+
+    def sized(self, view: StoredView, step: int) -> StoredView:
+        """The view as a step is to see it."""
+        height, width = view.rgb.shape[:2]
+        until = math.inf if self._until and height * width > WHOLE_PIXELS else self._until
+        if view.kind == "recorded" or step > until:
+            return view
+        if self._kept is None:
+            return halved(view)
+        if view.name not in self._kept:
+            self._kept[view.name] = halved(view)
+        return self._kept[view.name]
+
+
+def halved(view: StoredView) -> StoredView:
+    """The view at half its size: colours and confidence are means, labels and depth those of the nearest pixel. A pixel is masked where
+    any of those that it is made of is."""
+    height, width = (side // 2 for side in view.rgb.shape[:2])
+    if min(height, width) < LEAST_PX:
+        return view
+    nearest = {name: getattr(view, name) for name in ("channels", "sky", "depth")}
+    return replace(
+        view, view=view.view.resized(width, height), rgb=resize_area(view.rgb, width, height), lidar=_lidar(view, width, height),
+        mask=None if view.mask is None else resize_area(view.mask.astype(np.uint8) * 255, width, height) == 255,
+        confidence=None if view.confidence is None else resize_area(view.confidence, width, height),
+        **{name: None if plane is None else resize_nearest(plane, height, width) for name, plane in nearest.items()},
+    )  # fmt: skip
+
+
+def _lidar(view: StoredView, width: int, height: int) -> LidarPixels | None:
+    """Every measurement, in the pixel that it falls into."""
+    if view.lidar is None:
+        return None
+    tall, wide = view.rgb.shape[:2]
+    row, column = view.lidar.pixel // wide, view.lidar.pixel % wide
+    row, column = ((2 * place + 1) * new // (2 * old) for place, new, old in ((row, height, tall), (column, width, wide)))
+    return LidarPixels(row * width + column, view.lidar.depth_m)

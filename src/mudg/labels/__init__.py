@@ -1,0 +1,1 @@
+"""Depth, classes, sky and dynamic objects of recorded frames."""

@@ -1,0 +1,512 @@
+"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and dynamic objects, each pixel with a confidence.
+
+The result is a complete new scene; the given one is not touched. A label that a frame has already is kept, one that it lacks
+is made; a scene whose frames lack nothing is copied as it is. What made the labels is written into the scene's notes, so that
+nobody takes them for truth.
+
+Frames are labelled in separate processes, and each is staged when it is done: repeat the command to resume where it was
+stopped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from mudg import native
+from mudg.base import geometry, html, log, palette, store
+from mudg.base.devices import NETWORK_KINDS, choose_device
+from mudg.base.errors import ResourceError, UsageError
+from mudg.base.processes import one_torch_thread, run_in_processes
+from mudg.base.run_folder import RunDir
+from mudg.base.types import Frame, Scene, Sweep
+from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
+from mudg.core.pictures import class_colors, depth_colors, gray, resize_area
+from mudg.core.project import RULES as HIDING_RULES
+from mudg.core.project import visible_depth
+from mudg.labels import street_net
+from mudg.labels.by_geometry import RULES
+from mudg.labels.depth.inputs import DepthInput, DepthNetwork, DepthOptions
+from mudg.labels.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
+from mudg.labels.ground import driven_path
+from mudg.labels.inputs import LabelInput, Labels
+from mudg.labels.labellers import labeller
+from mudg.labels.settings import AnnotateConfig
+from mudg.networks.folders import CPU, Place, find, title
+from mudg.scene.contact_sheet import spread
+from mudg.scene.labels import read_label
+from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.write import SceneWriter
+
+# depth ----------------------------------------------------------------------------------------------------------------
+#
+# Networks of ``mudg annotate``: where they compute, what tells them apart in a scene's notes, and their depth in place of the filled.
+#
+# A frame whose LiDAR returns are too few, or do not fit the network's depth, keeps the depth that was filled from them; it is marked by
+# a small file beside its labels, warned of, and counted in the notes.
+
+
+_FILLED: Final = ".filled.json"
+
+
+def place(config: AnnotateConfig) -> Place:
+    """Where the networks of a configuration compute."""
+    device = choose_device(config.device, "networks of annotate", NETWORK_KINDS)
+    return Place(str(device), config.precision == "bfloat16")
+
+
+def placed(config: AnnotateConfig) -> AnnotateConfig:
+    """The configuration with its device chosen; of one without networks, only if it names a device.
+
+    Raises:
+        UsageError: not a device for networks. ResourceError: it is not on this machine.
+    """
+    if config.device == "auto" and config.labeller == "geometry" and not config.depth_network:
+        return replace(config, device="cpu")
+    return replace(config, device=place(config).device)
+
+
+def folders(config: AnnotateConfig) -> dict[str, Path]:
+    """Flag that names a network's folder -> that folder, where one is named and lies on this machine."""
+    found: dict[str, Path] = {}
+    for name, text in (("weights", config.weights), ("depth-network", config.depth_network)):
+        with contextlib.suppress(ResourceError):  # said when it is read, if it is
+            found |= {name: find(text)} if text else {}
+    return found
+
+
+def digests(config: AnnotateConfig) -> dict[str, str]:
+    """Field of the configuration that names a network's folder -> digest of the folder, for the networks that are used.
+
+    Raises:
+        UsageError: a depth network, but no depth. ResourceError: its folder is missing. InputError: it holds another kind.
+    """
+    found: dict[str, str] = {}
+    if config.labeller == "network" and config.weights and (weights := find(config.weights)).is_dir():
+        found["weights"] = store.digest(weights)
+    if config.labeller == "embedded":
+        found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
+    if config.depth_network:
+        if not config.depth:
+            raise UsageError("--depth-network contradicts --no-depth", where="--depth-network",
+                             remedy="leave out one of them")  # fmt: skip
+        kind_of(config.depth_network)
+        found["depth_network"] = store.digest(find(config.depth_network))
+    return found
+
+
+def load(config: AnnotateConfig) -> DepthNetwork | None:
+    """The depth network of a configuration, None if it names none.
+
+    Raises:
+        ResourceError, InputError: see ``load_depth_network``.
+    """
+    if not config.depth_network:
+        return None
+    return load_depth_network(
+        config.depth_network, place(config), DepthOptions(config.depth_guided, config.depth_steps)
+    )
+
+
+def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame_id: str, staging: Path) -> Labels:
+    """Labels with the network's depth, aligned to the frame's LiDAR, or as they are if it cannot be."""
+    measured = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
+    asked = DepthInput(given.rgb, measured, labels.depth, labels.sky)
+    reason = "too few LiDAR returns"
+    if enough_returns(asked):
+        found = align_to_lidar(network(asked), asked, RULES)
+        if found.dense is not None:
+            return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
+        reason = f"the network's depth does not fit the LiDAR (half of the returns off by more than {found.fit.residual:.0%})"
+        if not np.isfinite(found.fit.residual):
+            reason = "the network's depth does not increase with the LiDAR's"
+    log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
+    store.write_json(_mark(staging, frame_id), {"reason": reason})
+    return labels
+
+
+def depth_origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequence[str], staging: Path) -> str:
+    """Where the depth of these frames comes from, in words for the scene's notes."""
+    filled = f"points of {config.sweeps} sweeps, filled along the image, sky at a fixed distance"
+    if "depth_network" not in networks:
+        return filled
+    without = sum(_mark(staging, frame_id).is_file() for frame_id in made)
+    words = (
+        f"network '{kind_of(config.depth_network)}'{describe_folder(config.depth_network, networks['depth_network'])}, aligned to "
+        f"points of {config.sweeps} sweeps, sky at a fixed distance"
+    )
+    return words + (f"; {without} of them, where it did not fit: {filled}" if without else "")
+
+
+def describe_folder(folder: str, digest: str) -> str:
+    """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's notes."""
+    where = f" in folder '{title(find(folder))}'" if folder else ""
+    return f"{where} (sha256 {digest[:16]})"
+
+
+def _mark(staging: Path, frame_id: str) -> Path:
+    """File that says that a frame kept its filled depth."""
+    return staging / f"{frame_id}{_FILLED}"
+
+
+# the own vehicle in an image: what stays the same at the bottom of the image while everything else goes by ------------
+
+
+FRAMES: Final = 16
+MIN_TRAVEL_M: Final = 10.0
+MIN_SHARE: Final = 0.002
+"""A piece smaller than this share of the image is no bonnet."""
+
+
+def find_ego(scene: Scene, camera: str) -> NDArray[np.bool_]:
+    """Own vehicle in the images of a camera, bool[H, W]; empty (and said so) on a drive too short to tell."""
+    frames = scene.frames_of(camera)
+    size = (scene.cameras[camera].height, scene.cameras[camera].width)
+    steps = np.diff(scene.ego.world_from_ego[:, :3, 3], axis=0)
+    travel_m = float(np.linalg.norm(steps, axis=1).sum())
+    if len(frames) < 4 or travel_m < MIN_TRAVEL_M:
+        log.warn(
+            f"camera {camera}: the log is too short to find the own vehicle ({len(frames)} images, {travel_m:.0f} m)"
+        )
+        return np.zeros(size, bool)
+    at = np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))
+    return steady_bottom(np.stack([read_image(scene, frames[index]).mean(2) for index in at]))
+
+
+def steady_bottom(grey: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels joined to the lower edge that vary much less over time than the rest of the lower half.
+
+    Args:
+        grey: [N, H, W] images over a drive, 0..255.
+
+    Returns:
+        bool[H, W].
+    """
+    middle = np.median(grey, axis=0)
+    spread = ndimage.uniform_filter(np.median(np.abs(grey - middle), axis=0), 3)
+    height, width = spread.shape
+    limit = 0.35 * float(np.median(spread[height // 2 :]))
+    steady = ndimage.binary_opening(np.pad(spread < limit, 2, mode="edge"), np.ones((5, 5), bool))[2:-2, 2:-2]
+    steady[: height // 2] = False
+    pieces, count = ndimage.label(steady)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    joined = [piece for piece in np.unique(pieces[-1]) if piece and sizes[piece] > MIN_SHARE * height * width]
+    return ndimage.binary_fill_holes(np.isin(pieces, joined)) if joined else np.zeros((height, width), bool)
+
+
+# points ---------------------------------------------------------------------------------------------------------------
+#
+# LiDAR returns for an image: points of the sweeps around it, dynamic objects standing where they are at the image's time.
+
+
+MAX_GAP_S = 2.0
+"""Sweeps farther in time than this from an image do not help: what moves without a track has gone elsewhere."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Returns:
+    """``xyz_world`` f32[N, 3] metres; largest angle between neighbouring beams, and elevation of the highest beam."""
+
+    xyz_world: NDArray[np.float32]
+    beam_gap_deg: float
+    highest_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Separated:
+    """Static points of a sweep in the world, those of each dynamic object in its frame, and the sweep's beams."""
+
+    static: NDArray[np.float32]
+    owned: dict[int, NDArray[np.float32]]
+    gap_deg: float
+    highest_rad: float
+
+
+class NearbyReturns:
+    """Points of the ``sweeps`` sweeps of each LiDAR that are nearest in time to an image; sweeps are read once."""
+
+    def __init__(self, scene: Scene, sweeps: int) -> None:
+        self._scene, self._count = scene, sweeps
+        self._rules = FusionRules()
+        moving = [n for n, track in enumerate(scene.tracks) if judge_track(track, self._rules).moving]
+        self.moving = frozenset(moving)
+        """Numbers of the scene's tracks that move."""
+        self._dynamic_tracks = [scene.tracks[n] for n in moving]
+        self._sensors: dict[str, list[Sweep]] = {}
+        for sweep in scene.sweeps:
+            self._sensors.setdefault(sweep.sensor, []).append(sweep)
+        self._kept: dict[str, _Separated] = {}
+
+    def of(self, frame: Frame) -> Returns:
+        """Static points and dynamic objects as they stand at the frame's time; no points where no sweep is near."""
+        time_s = frame.view.time_s
+        chosen = [s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, self._count)]
+        ids = {sweep.id for sweep in chosen}
+        self._kept = {key: value for key, value in self._kept.items() if key in ids}
+        parts = [np.zeros((0, 3), np.float32)]
+        known = [self._separated(sweep) for sweep in chosen]
+        for sweep in known:
+            parts.append(sweep.static)
+            parts += list(self._dynamic_points_at(time_s, sweep.owned))
+        gap = min((sweep.gap_deg for sweep in known), default=0.6)
+        return Returns(np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0))
+
+    def _dynamic_points_at(self, time_s: float, owned: dict[int, NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
+        for index, xyz_object in owned.items():
+            pose = self._dynamic_tracks[index].pose_at(time_s)
+            if pose is not None:
+                yield geometry.transform_points(pose, xyz_object).astype(np.float32)
+
+    def _separated(self, sweep: Sweep) -> _Separated:
+        if sweep.id not in self._kept:
+            points = read_points(self._scene, sweep)
+            shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
+            owner, owned = separate(shots, self._dynamic_tracks, self._rules)
+            world = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
+            self._kept[sweep.id] = _Separated(
+                world[owner == STATIC], owned, largest_beam_gap(points.xyz), _highest(sweep, world)
+            )
+        return self._kept[sweep.id]
+
+
+def nearest_sweeps(sweeps: Sequence[Sweep], time_s: float, count: int) -> list[Sweep]:
+    """The ``count`` sweeps nearest in time, none farther than ``MAX_GAP_S``, in the order of their times."""
+    near = sorted((s for s in sweeps if abs(s.time_s - time_s) <= MAX_GAP_S), key=lambda s: abs(s.time_s - time_s))
+    return sorted(near[:count], key=lambda s: s.time_s)
+
+
+def _highest(sweep: Sweep, world: NDArray[np.float32]) -> float:
+    """Elevation of the highest beam, radians: all but a few stray returns lie below it."""
+    if len(world) < 100:
+        return 0.0
+    ray = world - sweep.world_from_lidar[:3, 3].astype(np.float32)
+    elevation = np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))
+    return float(np.quantile(elevation, 0.998))
+
+
+# annotate page --------------------------------------------------------------------------------------------------------
+#
+# ``labels.html`` of an annotated scene: pictures of some frames beside what was made of them.
+#
+# Columns: image; depth (near warm, far cold, darker where unsure); classes over the image, dynamic objects outlined in red; confidence
+# of the classes. What to look for: edges of the depth lie on edges of the image, the road has no steps, sky ends at the roofs.
+
+
+NAME: Final = "labels.html"
+_FRAMES: Final = 6
+_WIDTH_PX: Final = 480
+_OUTLINE: Final = np.array([255, 40, 40], np.uint8)
+
+
+def write_page(scene: Scene, made: set[str], out: Path) -> Path:
+    """Write ``labels.html`` and ``pictures/``: some frames of every camera; ``made``: ids of frames that got labels."""
+    pictures: list[dict[str, str]] = []
+    for camera in scene.cameras:
+        labelled = [frame for frame in scene.frames_of(camera) if frame.id in made]
+        for frame in spread(labelled or scene.frames_of(camera), _FRAMES):
+            name = f"pictures/{frame.id.replace('/', '_')}.jpg"
+            store.write_image(out / name, picture(scene, frame), quality=88)
+            pictures.append({"file": name, "caption": _caption(scene, frame)})
+    text = html.render(
+        "labels.html.j2", title=f"Labels of {scene.id}", kicker="mudg annotate", notes=scene.source.notes, pictures=pictures,
+        lead="Image; depth (near warm, far cold, darker where unsure); classes, with dynamic objects outlined in red; "
+        "confidence of the classes.",
+        class_legend=html.class_legend(),
+    )  # fmt: skip
+    store.write_text(out / NAME, text)
+    return out / NAME
+
+
+def _caption(scene: Scene, frame: Frame) -> str:
+    parts = [frame.id, f"{frame.view.time_s:.2f} s"]
+    if "depth" in frame.labels:
+        depth = read_label(scene, frame, "depth")
+        parts.append(f"depth known {100 * np.isfinite(depth).mean():.0f} %")
+    if "semantics" in frame.labels:
+        parts.append(
+            f"classes known {100 * (read_label(scene, frame, 'semantics') != palette.UNLABELLED).mean():.0f} %"
+        )
+    return ", ".join(parts)
+
+
+def picture(scene: Scene, frame: Frame) -> Image.Image:
+    """Image, depth, classes and confidence beside each other; what a frame lacks is black."""
+    rgb = read_image(scene, frame)
+    panels = [rgb, np.zeros_like(rgb), np.zeros_like(rgb), np.zeros_like(rgb)]
+    if "depth" in frame.labels:
+        panels[1] = _depth_picture(scene, frame)
+    if "semantics" in frame.labels:
+        colors = class_colors(read_label(scene, frame, "semantics"))
+        panels[2] = (0.45 * rgb + 0.55 * colors).astype(np.uint8)
+    if "dynamic" in frame.labels:
+        mask = read_label(scene, frame, "dynamic").astype(bool)
+        panels[2][mask & ~ndimage.binary_erosion(mask, iterations=max(1, rgb.shape[1] // 500))] = _OUTLINE
+    if "semantics_confidence" in frame.labels:
+        panels[3] = gray(read_label(scene, frame, "semantics_confidence"))
+    height = max(1, round(rgb.shape[0] * _WIDTH_PX / rgb.shape[1]))
+    return Image.fromarray(np.concatenate([resize_area(panel, _WIDTH_PX, height) for panel in panels], 1))
+
+
+def _depth_picture(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
+    colors = depth_colors(read_label(scene, frame, "depth"))
+    if "depth_confidence" in frame.labels:
+        sure = read_label(scene, frame, "depth_confidence")
+        colors = (colors * (0.35 + 0.65 * sure[..., None])).astype(np.uint8)
+    return colors
+
+
+# annotate -------------------------------------------------------------------------------------------------------------
+
+
+_STAGING = "labelled"
+_SHARING = 4
+"""Processes that share a device with the shipped network: each holds a context of some hundred megabytes there."""
+_FRAMES_PER_PROCESS = 8
+"""Fewer frames than this are not worth the start of a process."""
+
+
+def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[str, Any]:
+    """Label a scene; the work folder becomes a scene with labels, and ``labels.html`` shows some of them. Returns a summary."""
+    loaded, out = read_scene(scene), work.path
+    wanted = wanted_labels(config)
+    missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]
+    if not missing:
+        log.info("annotate: the scene already has all labels; nothing to add")
+    if not (out / "scene.json").is_file():
+        staging = out / _STAGING
+        _label_frames(config, scene, loaded, missing, staging)
+        source = dataclasses.replace(
+            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, work.inputs, staging))
+        )
+        with SceneWriter(out, loaded.id, source) as writer:
+            writer.copy_all_but_frames(loaded)
+            _add_frames(config, loaded, missing, staging, writer)
+            writer.finish()
+    write_page(read_scene(out), {frame.id for frame in missing}, out)
+    shutil.rmtree(out / _STAGING, ignore_errors=True)
+    return {"labelled": len(missing), "labeller": config.labeller if missing else "labels present"}
+
+
+def wanted_labels(config: AnnotateConfig) -> set[str]:
+    """Names of the labels that every frame shall have; a confidence comes only with a label that was made."""
+    return {"semantics", "sky"} | ({"depth"} if config.depth else set()) | ({"dynamic"} if config.dynamic else set()) | (
+        {"ego"} if config.ego else set()
+    )  # fmt: skip
+
+
+def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str, str], staging: Path) -> Iterator[str]:
+    """A sentence for each label that was made: for how many frames, and from what."""
+    made_by = f"labeller '{config.labeller}'"
+    if "weights" in inputs:
+        made_by += describe_folder(config.weights, inputs["weights"])
+    depth = depth_origin(config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], staging)
+    origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
+               "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip
+    for name, origin in origins.items():
+        count = sum(name in wanted_labels(config) and name not in frame.labels for frame in missing)
+        if count:
+            yield f"{name} of {count} frames: {origin}, not truth"
+
+
+# --- one frame after the other ----------------------------------------------------------------------------------------
+
+
+def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Sequence[Frame], staging: Path) -> None:
+    """Put the labels of every frame that has none yet into ``staging``."""
+    todo = [frame.id for frame in missing if not staged_labels(staging, frame.id).is_file()]
+    if len(todo) < len(missing):
+        log.info(f"annotate: {len(missing) - len(todo)} frames are labelled already")
+    most = config.processes or _usual_processes(config)
+    processes = min(most, len(todo) // _FRAMES_PER_PROCESS)
+    with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:
+        if processes <= 1:
+            for _ in label_into_staging(config, scene, todo, staging):
+                bar.advance()
+            return
+        work = [
+            (config, path, list(part), staging)
+            for part in np.array_split(np.array(todo, dtype=object), 4 * processes)
+            if len(part)
+        ]
+        for _, labelled in run_in_processes(_label_in_process, work, processes):
+            bar.advance(labelled)
+
+
+def _usual_processes(config: AnnotateConfig) -> int:
+    """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with the shipped one,
+    whose evidence is gathered on the CPU meanwhile."""
+    cores = native.default_threads()
+    if config.device == "cpu" or (config.labeller == "geometry" and not config.depth_network):
+        return cores
+    return 1 if config.labeller == "network" or config.depth_network else min(cores, _SHARING)
+
+
+def _label_in_process(config: AnnotateConfig, path: Path, ids: list[str], staging: Path) -> int:
+    return sum(1 for _ in label_into_staging(config, read_scene(path), ids, staging))
+
+
+def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str], staging: Path) -> Iterator[str]:
+    """Label these frames one after the other, write each to ``staging``, and name it when it is there."""
+    if not ids:
+        return
+    label = labeller(config.labeller, config.weights, place(config) if config.labeller != "geometry" else CPU)
+    network = load(config)
+    returns = NearbyReturns(scene, config.sweeps)
+    path = driven_path(scene.ego.world_from_ego)
+    frames = {frame.id: frame for frame in scene.frames}
+    for frame_id in ids:
+        frame = frames[frame_id]
+        near = returns.of(frame)
+        given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, path, near.beam_gap_deg,
+                           near.highest_rad, returns.moving)  # fmt: skip
+        with one_torch_thread():
+            labels = label(given)
+            if network is not None and "depth" not in frame.labels:
+                labels = with_network(network, given, labels, frame_id, staging)
+        store.write_safetensors(staged_labels(staging, frame_id), label_arrays(config, labels))
+        yield frame_id
+
+
+def staged_labels(staging: Path, frame_id: str) -> Path:
+    """Where the labels of a frame lie until the scene is written."""
+    return staging / f"{frame_id}.safetensors"
+
+
+def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[Any]]:
+    """Labels under the names that a scene has for them; what was not asked for is left out."""
+    arrays: dict[str, NDArray[Any]] = {
+        "semantics": labels.semantics, "sky": labels.sky, "semantics_confidence": labels.confidence,
+    }  # fmt: skip
+    if config.depth:
+        arrays |= {"depth": labels.depth, "depth_confidence": labels.depth_confidence}
+    if config.dynamic:
+        arrays["dynamic"] = labels.dynamic
+    return arrays
+
+
+def _add_frames(
+    config: AnnotateConfig, scene: Scene, missing: Sequence[Frame], staging: Path, writer: SceneWriter
+) -> None:
+    ego = {name: find_ego(scene, name) for name in scene.cameras} if config.ego else {}
+    lacking = {frame.id for frame in missing}
+    for frame in scene.frames:
+        if frame.id not in lacking:
+            writer.copy_frame(scene, frame)
+            continue
+        arrays = store.read_safetensors(staged_labels(staging, frame.id))
+        for name in ("semantics", "depth"):  # a confidence tells that a label was made: none beside one that was given
+            if name in frame.labels:
+                arrays.pop(f"{name}_confidence", None)
+        if config.ego:
+            arrays["ego"] = ego[frame.view.camera.name]
+        writer.copy_frame(scene, frame, arrays)

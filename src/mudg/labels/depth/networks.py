@@ -1,0 +1,247 @@
+"""Dense depth by a pretrained network from a folder on disk, brought to the frame's LiDAR.
+
+| folder | what it gives | how |
+|---|---|---|
+| PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
+| Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
+| Marigold (``models.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
+| DepthLab (``models.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
+
+The result is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the sky gets
+its fixed distance, and the confidence follows from the error of the aligned depth at the returns near a pixel. There is no result
+where too few returns are visible, or where the network's depth does not fit them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base.errors import InputError, ResourceError
+from mudg.core.depth import MIN_POINTS, AffineFit, CompletionRules, DenseDepth, Space, fit_affine
+from mudg.core.pictures import resize_bicubic
+from mudg.labels.depth.depthlab import DepthLab
+from mudg.labels.depth.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
+from mudg.labels.depth.marigold import Marigold
+from mudg.networks import folders
+from mudg.networks.folders import CPU, Place
+
+CUE_PX: Final = 256
+"""Longest side of the small depth map that PromptDepthAnything is given (its training had 256x192)."""
+_ERROR_SCALE: Final = 0.05
+_SKY_CONFIDENCE: Final = 0.8
+
+
+# --- networks of transformers -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Preparation:
+    """Preparation of images as a folder describes it: size in pixels, the multiple of both sides, mean and deviation of colours in 0..1."""
+
+    height: int
+    width: int
+    multiple: int
+    keep_aspect: bool
+    mean: tuple[float, ...]
+    deviation: tuple[float, ...]
+
+    @classmethod
+    def read(cls, folder: Path, side_px: int, multiple: int) -> Preparation:
+        """From ``preprocessor_config.json``; side and multiple where it is silent."""
+        file = folder / "preprocessor_config.json"
+        settings = folders.read_settings(file) if file.is_file() else {}
+        size = settings.get("size") or {}
+        if not isinstance(size, dict):
+            size = {"height": size, "width": size}
+        return cls(
+            int(size.get("height", side_px)), int(size.get("width", side_px)), int(settings.get("ensure_multiple_of") or multiple),
+            bool(settings.get("keep_aspect_ratio", True)), tuple(settings.get("image_mean") or folders.MEAN),
+            tuple(settings.get("image_std") or folders.DEVIATION),
+        )  # fmt: skip
+
+    def size_for(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width the network reads: with the aspect kept, the side that changes less gets its size."""
+        by = [self.height / height, self.width / width]
+        if self.keep_aspect:
+            by = [min(by, key=lambda factor: abs(1 - factor))] * 2
+        high, wide = (
+            max(1, round(factor * side / self.multiple)) * self.multiple for factor, side in zip(by, (height, width))
+        )
+        return high, wide
+
+    def pixels(self, rgb: NDArray[np.uint8]) -> Tensor:
+        """Image u8[H, W, 3] -> f32[1, 3, h, w] as the network wants it."""
+        height, width = self.size_for(*rgb.shape[:2])
+        return folders.normalized(resize_bicubic(rgb, width, height), self.mean, self.deviation)
+
+
+class TransformersDepth:
+    """A depth network of transformers, ready for use; ``with_lidar``: it reads a small depth map beside the image."""
+
+    def __init__(
+        self, network: Any, preparation: Preparation, space: Space, *, with_lidar: bool, place: Place = CPU
+    ) -> None:
+        self._network, self._preparation, self._space = network, preparation, space
+        self._with_lidar, self._place = with_lidar, place
+
+    def __call__(self, given: DepthInput) -> Prediction:
+        """Depth of one image at the image's size."""
+        inputs = {"pixel_values": self._preparation.pixels(given.rgb)}
+        if self._with_lidar:
+            inputs["prompt_depth"] = lidar_cue(given)
+        with torch.inference_mode(), self._place.autocast():
+            output = self._network(**{name: value.to(self._place.device) for name, value in inputs.items()})
+        return Prediction.resized(output.predicted_depth.float()[:, None], given, self._space)
+
+
+def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
+    """Small depth map f32[1, 1, h, w] metres without holes: returns filled along the image, the sky as far as the farthest.
+
+    The network scales the map to 0..1 by its least and greatest value; the sky at its own distance would squeeze all the rest.
+
+    Raises:
+        InputError: nothing was measured.
+    """
+    ground = np.isfinite(given.filled) & ~given.sky
+    if not ground.any():
+        raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
+    far_m, near_m = (float(np.quantile(given.filled[ground], share)) for share in (0.995, 0.005))
+    dense = np.where(ground, given.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
+    height, width = dense.shape
+    scale = min(1.0, longest_px / max(height, width))
+    size = (max(1, round(height * scale)), max(1, round(width * scale)))
+    small = functional.interpolate(
+        torch.from_numpy(dense.astype(np.float32))[None, None], size=size, mode="nearest-exact"
+    )
+    if float(small.max() - small.min()) <= 0:
+        small[..., 0, 0] *= 1.01  # the network divides by the range
+    return small
+
+
+def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> TransformersDepth:
+    class_name = "PromptDepthAnythingForDepthEstimation" if with_lidar else "DepthAnythingForDepthEstimation"
+    network_class = folders.member(folders.package("transformers"), class_name)
+    network: Any = folders.load_network(network_class, folder, place)
+    preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
+    metric = with_lidar or network.config.depth_estimation_type == "metric"
+    return TransformersDepth(network, preparation, "depth" if metric else "disparity", with_lidar=with_lidar, place=place)
+
+
+# --- folders ----------------------------------------------------------------------------------------------------------
+
+
+KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
+    "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
+    "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
+    "MarigoldDepthPipeline": Marigold.load,
+    "MarigoldPipeline": Marigold.load,
+    "depthlab": DepthLab.load,
+}
+"""``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the ``model.json`` that
+``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders have the shorter name."""
+_DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
+
+
+def kind_of(folder: str | Path) -> str:
+    """Kind of network according to a folder's description; nothing else of it is read.
+
+    Raises:
+        ResourceError: no such folder, or it has no description. InputError: another kind of network.
+    """
+    path = folders.find(folder)
+    for name, key in _DESCRIPTIONS:
+        if folder and (path / name).is_file():
+            kind = str(folders.read_settings(path / name).get(key))
+            if kind not in KINDS:
+                raise InputError("the folder holds another kind of network", where=str(path / name),
+                    expected=", ".join(KINDS), got=kind)  # fmt: skip
+            return kind
+    raise ResourceError("the depth network's weights are missing", where=str(folder) or "--depth-network",
+        expected="a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)",
+        remedy="give the folder of such a network as --depth-network, or leave the flag out")  # fmt: skip
+
+
+def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
+    """A depth network of the table, read from its folder, or from the Hugging Face cache by its name (``folders.find``).
+
+    Raises:
+        ResourceError: folder, package or device is missing. InputError: another kind of network, or not all of it.
+    """
+    path = folders.find(folder)
+    return KINDS[kind_of(path)](path, place, options)
+
+
+# --- alignment to LiDAR, for every network ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """Dense depth and its confidence, or None where the fit to the LiDAR is not to be believed."""
+
+    dense: DenseDepth | None
+    fit: AffineFit
+
+
+def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionRules) -> Aligned:
+    """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence.
+
+    Raises:
+        InputError: prediction and image differ in size.
+    """
+    if prediction.values.shape != given.measured.shape:
+        raise InputError("a network's depth and its image differ in size", where="depth network",
+            expected=str(given.measured.shape), got=str(prediction.values.shape))  # fmt: skip
+    known = np.isfinite(given.measured) & ~given.sky
+    values, measured = prediction.values[known], given.measured[known]
+    fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
+    if not fit.used:
+        return Aligned(None, fit)
+    depth = fit.depth(torch.from_numpy(prediction.values).double(), rules.near_m, rules.far_m).float().numpy()
+    confidence = residual_confidence(depth, np.where(known, given.measured, np.float32(np.nan)), given.sky, rules.sky_m)
+    depth[given.sky] = rules.sky_m
+    return Aligned(DenseDepth(depth, confidence), fit)
+
+
+def residual_confidence(
+    depth: NDArray[np.float32], measured: NDArray[np.float32], sky: NDArray[np.bool_], sky_m: float
+) -> NDArray[np.float32]:
+    """exp(-e / 0.05) of the relative error e to be expected, f32[H, W] in 0..1; the same scale as that of ``core.complete``.
+
+    e is the mean error at the measurements around a pixel, within the distance that most pixels have to one. Away from all of them it
+    goes over to twice the frame's mean error: nothing was compared there. Steps of depth around the pixel add to it.
+
+    Args:
+        depth, measured: f32[H, W] metres, the latter NaN where nothing was measured.
+        sky: bool[H, W].
+        sky_m: its distance.
+    """
+    known = np.isfinite(measured)
+    off = np.zeros(depth.shape, np.float32)
+    off[known] = np.minimum(np.abs(np.log(depth[known] / measured[known])), 1)
+    rows = np.flatnonzero(known.any(1))
+    away_px: Any = ndimage.distance_transform_edt(~known)
+    reach_px = max(3.0, 2 * float(np.quantile(away_px[rows[0] : rows[-1] + 1], 0.9)))
+    near: Any = ndimage.gaussian_filter(known.astype(np.float32), reach_px, mode="constant")
+    total: Any = ndimage.gaussian_filter(off, reach_px, mode="constant")
+    usual = 0.02 * float(near[known].mean())  # the say of not knowing, beside the usual number of measurements
+    error = (total + usual * 2 * float(off[known].mean())) / (near + usual)
+    around = np.log(np.where(sky, np.float32(sky_m), depth))
+    steps = ndimage.maximum_filter(around, 5) - ndimage.minimum_filter(around, 5)
+    confidence = np.exp(-(0.002 + error + 0.05 * np.minimum(steps, 1)) / _ERROR_SCALE).astype(np.float32)
+    confidence[sky] = _SKY_CONFIDENCE
+    return confidence
+
+
+def enough_returns(given: DepthInput) -> bool:
+    """Whether the image has enough returns for an alignment."""
+    return int((np.isfinite(given.measured) & ~given.sky).sum()) >= MIN_POINTS

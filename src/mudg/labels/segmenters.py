@@ -1,0 +1,179 @@
+"""Classes by a pretrained segmentation network from a folder on disk: SegFormer, Mask2Former or EoMT with Cityscapes classes.
+
+The networks come from the ``transformers`` package (see ``models.folders``); nothing is downloaded: the folder holds ``config.json``,
+``preprocessor_config.json`` and ``model.safetensors`` as that package writes them. Class names of the folder are matched with ours
+by name. Large images are cut into overlapping tiles whose probabilities are averaged. EoMT reads squares of one size only: images
+are scaled until their shorter side has that size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from mudg.base.errors import InputError, ResourceError
+from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.networks import folders
+from mudg.networks.folders import CPU, Place
+
+TILE_PX: Final = 1024
+OVERLAP: Final = 0.25
+BATCH: Final = 2
+
+
+def _dense(output: Any, size: tuple[int, int]) -> Tensor:
+    """SegFormer: logits [B, C, h, w] -> probabilities [B, C, H, W]."""
+    logits = functional.interpolate(output.logits.float(), size=size, mode="bilinear", align_corners=False)
+    return logits.softmax(1)
+
+
+def _masks(output: Any, size: tuple[int, int]) -> Tensor:
+    """Mask2Former, EoMT: classes [B, Q, C + 1] (the last: none) and masks [B, Q, h, w] -> probabilities [B, C, H, W]."""
+    classes = output.class_queries_logits.float().softmax(-1)[..., :-1]
+    masks = functional.interpolate(output.masks_queries_logits.float(), size=size, mode="bilinear", align_corners=False)
+    scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
+    return scores / scores.sum(1, keepdim=True).clamp(min=1e-6)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """Class of transformers that holds the network, how its output becomes probabilities, and whether it reads squares of the one
+    size that its configuration names."""
+
+    class_name: str
+    probabilities: Callable[[Any, tuple[int, int]], Tensor]
+    square: bool = False
+
+
+KINDS: Final[Mapping[str, _Kind]] = {
+    "segformer": _Kind("SegformerForSemanticSegmentation", _dense),
+    "mask2former": _Kind("Mask2FormerForUniversalSegmentation", _masks),
+    "eomt": _Kind("EomtForUniversalSegmentation", _masks, square=True),
+}
+"""``model_type`` of a folder's ``config.json`` -> network."""
+
+
+class Segmenter:
+    """A network ready for use; ``load`` makes one from a folder."""
+
+    def __init__(
+        self, network: Any, kind: str, train_ids: NDArray[np.intp], mean: Sequence[float], deviation: Sequence[float],
+        square_px: int = 0, place: Place = CPU,
+    ) -> None:  # fmt: skip
+        """``train_ids`` [C]: our class of each of the network's, UNLABELLED = none; mean and deviation of colours in 0..1;
+        ``square_px``: side of the only tile that the network reads, 0 = any."""
+        self._network, self._kind, self._train_ids = network, KINDS[kind], train_ids
+        self._mean = torch.tensor(mean, dtype=torch.float32)[:, None, None]
+        self._deviation = torch.tensor(deviation, dtype=torch.float32)[:, None, None]
+        self._square_px, self._place = square_px, place
+
+    @classmethod
+    def load(cls, folder: str | Path, place: Place = CPU) -> Segmenter:
+        """Read a network from a local folder, or from the Hugging Face cache by its name (``folders.find``).
+
+        Raises:
+            ResourceError: the folder, the device or the transformers package is missing. InputError: another kind of network, one
+            that lacks weights, or none of its class names is one of ours.
+        """
+        path = folders.find(folder)
+        if not folder or not (path / "config.json").is_file():
+            raise ResourceError("the labeller's weights are missing", where=str(folder) or "weights",
+                expected="a folder with config.json and model.safetensors",
+                remedy="give the folder of a segmentation network with Cityscapes classes as --weights, or its name in the Hugging Face "
+                "cache, or use --labeller geometry")  # fmt: skip
+        settings = folders.read_settings(path / "config.json")
+        kind = str(settings.get("model_type"))
+        if kind not in KINDS:
+            raise InputError("the folder holds another kind of network", where=str(path / "config.json"),
+                expected=", ".join(KINDS), got=kind)  # fmt: skip
+        train_ids = match_classes(settings.get("id2label", {}), str(path / "config.json"))
+        prepared = path / "preprocessor_config.json"
+        colors = folders.read_settings(prepared) if prepared.is_file() else {}
+        network_class = folders.member(folders.package("transformers"), KINDS[kind].class_name)
+        network = folders.load_network(network_class, path, place)
+        square_px = int(network.config.image_size) if KINDS[kind].square else 0  # type: ignore[union-attr, arg-type]
+        mean, deviation = colors.get("image_mean", folders.MEAN), colors.get("image_std", folders.DEVIATION)
+        return cls(network, kind, train_ids, mean, deviation, square_px, place)
+
+    def classes(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Train ids u8[H, W] and the probability of each f32[H, W] of an image u8[H, W, 3]."""
+        size = rgb.shape[:2]
+        image = torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255
+        if self._square_px:
+            image = _with_shorter_side(image, self._square_px)
+        total = self._probabilities((image - self._mean) / self._deviation)
+        if total.shape[1:] != size:
+            total = functional.interpolate(total[None], size=size, mode="bilinear", align_corners=False)[0]
+        confidence, ids = total.max(0)
+        return ids.numpy().astype(np.uint8), confidence.clamp(0, 1).numpy()
+
+    def _probabilities(self, image: Tensor) -> Tensor:
+        """Probability of each of our classes [C, H, W] of a normalised image [3, H, W], tile by tile."""
+        height, width = image.shape[1:]
+        side = self._square_px or TILE_PX
+        tile = (min(height, side), min(width, side))
+        corners = [(y, x) for y in tile_starts(height, tile[0]) for x in tile_starts(width, tile[1])]
+        total = torch.zeros(len(CLASSES), height, width)
+        weight = torch.zeros(1, height, width)
+        ours = torch.from_numpy(self._train_ids)
+        known = ours != UNLABELLED
+        fade = _fade(tile)
+        for first in range(0, len(corners), BATCH):
+            chosen = corners[first : first + BATCH]
+            tiles = torch.stack([image[:, y : y + tile[0], x : x + tile[1]] for y, x in chosen])
+            with torch.inference_mode(), self._place.autocast():
+                output = self._network(pixel_values=tiles.to(self._place.device))
+            with torch.inference_mode():
+                found = self._kind.probabilities(output, tile).cpu()
+            for (y, x), probabilities in zip(chosen, found, strict=True):
+                window = total[:, y : y + tile[0], x : x + tile[1]]
+                window.index_add_(0, ours[known], probabilities[known] * fade)
+                weight[:, y : y + tile[0], x : x + tile[1]] += fade
+        return total / weight
+
+
+def _with_shorter_side(image: Tensor, side_px: int) -> Tensor:
+    """An image [3, H, W] scaled, smoothly, until its shorter side has ``side_px`` pixels."""
+    height, width = image.shape[1:]
+    scale = side_px / min(height, width)
+    size = (max(side_px, round(height * scale)), max(side_px, round(width * scale)))
+    if size == (height, width):
+        return image
+    return functional.interpolate(image[None], size=size, mode="bilinear", align_corners=False, antialias=True)[0]
+
+
+def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:
+    """Our train id of each class of a network by its name, UNLABELLED where we have none; i64[C].
+
+    Raises:
+        InputError: none of the names is one of ours.
+    """
+    wanted = {name.replace(" ", "").lower(): index for index, name in enumerate(CLASSES)}
+    ordered = [names[key] for key in sorted(names, key=int)]
+    found = [wanted.get(str(name).replace(" ", "").replace("_", "").lower(), UNLABELLED) for name in ordered]
+    if not any(index != UNLABELLED for index in found):
+        raise InputError("none of the network's classes is a Cityscapes class", where=where,
+            expected=", ".join(CLASSES), got=", ".join(map(str, ordered[:8])) or "no id2label")  # fmt: skip
+    return np.array(found, np.intp)
+
+
+def tile_starts(length: int, tile: int) -> list[int]:
+    """First pixels of tiles that cover ``length``, evenly spread, overlapping by at least ``OVERLAP`` of a tile."""
+    if length <= tile:
+        return [0]
+    count = 1 + int(np.ceil((length - tile) / (tile * (1 - OVERLAP))))
+    return [round(at) for at in np.linspace(0, length - tile, count)]
+
+
+def _fade(tile: tuple[int, int]) -> Tensor:
+    """Weight of a tile's pixels [H, W], falling towards its edges."""
+    ramps = [1 - (torch.linspace(-1, 1, size).abs() * 0.95) for size in tile]
+    return ramps[0][:, None] * ramps[1][None]

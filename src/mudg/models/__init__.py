@@ -1,1 +1,0 @@
-"""Floor 3: everything that holds parameters. Knows no file."""

@@ -1,1 +1,0 @@
-"""Labellers: semantic classes and sky from images, LiDAR and boxes."""

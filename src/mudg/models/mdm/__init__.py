@@ -1,1 +1,0 @@
-"""The small multi-modal diffusion model: network, codec, refiner, and the model that holds them."""

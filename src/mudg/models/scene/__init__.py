@@ -1,1 +1,0 @@
-"""The dynamic Gaussian scene: nodes, motion, densification, appearance."""

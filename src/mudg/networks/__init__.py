@@ -1,0 +1,1 @@
+"""Networks that several rooms use: features of images, the codec, attention towers."""

@@ -1,0 +1,449 @@
+"""Feature extractors for perceptual comparison: a fixed filter bank, the shipped codec's network, the trunk of LPIPS.
+
+By default fits use the filter bank and scores the codec.
+
+Each takes an image and returns a list of feature maps. ``FilterBank`` needs no weights; it follows what is known of early vision
+(Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours):
+
+* opponent colours: luminance and two chroma axes, compared on blurred images only (the eye resolves colour coarsely);
+* per scale (1, 1/2, 1/4 of the size): first-derivative responses in four orientations, divided by the local contrast, so that
+  a weak texture in shadow counts as much as a strong one in the sun;
+* the responses' *energy*, pooled over a few pixels: two images of the same texture that are misaligned by a
+  pixel are close, where L1 sees two different images and answers with blur.
+
+The bank is differentiable, deterministic, and costs about as much as SSIM.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from mudg.base.errors import InputError, UsageError
+from mudg.core.losses import distance_places, lpips_distance, unit_features
+from mudg.core.metrics import Pair
+from mudg.core.native_ops import box_mean
+from mudg.networks.codec import PatchCodec
+
+OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
+
+
+class FilterBank(nn.Module):
+    """Fixed multi-scale features of an image ``[3, H, W]`` in [0, 1].
+
+    Args:
+        scales: number of octaves; the image must be at least ``4 * 2**scales`` pixels in each direction.
+
+    Returns (from ``forward``):
+        Per scale one tensor ``[C, h, w]``: normalised signed derivatives (2), their pooled energy (4 orientations) and the
+        blurred opponent colours (3); C = 9.
+    """
+
+    CONTRAST_FLOOR: Final = 0.02
+
+    def __init__(self, scales: int = 3) -> None:
+        super().__init__()
+        self.scales = scales
+        self.register_buffer("opponent", torch.tensor(OPPONENT))
+
+    def forward(self, rgb: Tensor) -> list[Tensor]:
+        """Feature maps of one image, finest scale first."""
+        colors = (self.opponent.to(rgb.dtype) @ rgb.flatten(1)).view(1, *rgb.shape)
+        features = []
+        for scale in range(self.scales):
+            features.append(self._features(colors)[0])
+            if scale + 1 < self.scales:
+                colors = F.avg_pool2d(colors, 2, ceil_mode=True, count_include_pad=False)
+        return features
+
+    def _features(self, colors: Tensor) -> Tensor:
+        slope: Tensor = _Slope.apply(F.pad(colors[:, :1], (1, 1, 1, 1), mode="replicate"))  # type: ignore[assignment]
+        power = (slope**2).sum(1, keepdim=True)
+        contrast = torch.sqrt(box_mean(power, 7) + self.CONTRAST_FLOOR**2)
+        dx, dy = slope[:, :1] / contrast, slope[:, 1:] / contrast
+        diagonal, antidiagonal = (dx + dy) * 0.5**0.5, (dx - dy) * 0.5**0.5
+        energy = box_mean(torch.cat([dx, dy, diagonal, antidiagonal], 1) ** 2, 5)
+        amplitude = torch.sqrt(energy + 1e-4)
+        return torch.cat([0.5 * dx, 0.5 * dy, amplitude, 4.0 * box_mean(colors, 5)], 1)
+
+
+class _Slope(torch.autograd.Function):
+    """Differences along x and y of a plane, smoothed across: ``[1, 1, H + 2, W + 2]`` -> ``[1, 2, H, W]``. The same as a convolution with
+    two kernels of 3x3, whose backward pass takes ten times as long for a single channel."""
+
+    @staticmethod
+    def forward(ctx: Any, padded: Tensor) -> Tensor:
+        plane = padded[0, 0]
+        rows = (plane[:-2] + plane[2:]).add_(plane[1:-1], alpha=2)
+        columns = (plane[:, :-2] + plane[:, 2:]).add_(plane[:, 1:-1], alpha=2)
+        return torch.stack([rows[:, 2:] - rows[:, :-2], columns[2:] - columns[:-2]])[None] / 8
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> Tensor:
+        across, down = upstream[0] / 8
+        height, width = across.shape
+        rows, columns = across.new_zeros(height, width + 2), across.new_zeros(height + 2, width)
+        rows[:, 2:] += across
+        rows[:, :-2] -= across
+        columns[2:] += down
+        columns[:-2] -= down
+        plane = across.new_zeros(height + 2, width + 2)
+        for shift, share in ((0, 1), (1, 2), (2, 1)):
+            plane[shift : height + shift].add_(rows, alpha=share)
+            plane[:, shift : width + shift].add_(columns, alpha=share)
+        return plane[None, None]
+
+
+class CodecFeatures(nn.Module):
+    """Features of an image ``[3, H, W]`` in [0, 1]: activations of the codec's decoder network on the image's own code.
+
+    The codec's encoder is one linear map of 2x2 pixels; what the codec has learned about images lies in the decoder network, which
+    was trained to restore what the code lost. Its stages (the first convolution and each residual block) are the features, for
+    the image at full, half and quarter size. Depth and classes are withheld, as in a part of the codec's training.
+
+    Returns (from ``forward``):
+        Per size, largest first, and per stage one tensor ``[C, h, w]``.
+    """
+
+    SIZES: Final = 3
+    STEP: Final = 8
+    """Rows of the image that become one row of the smallest features."""
+
+    def __init__(self, codec: PatchCodec) -> None:
+        super().__init__()
+        self.codec = codec
+
+    @property
+    def reach_rows(self) -> int:
+        """Rows of the image above and below a row that its features depend on, rounded up to ``STEP``: one convolution and two per
+        block, at the smallest size."""
+        return self.STEP * (2 + 2 * len(self.codec.blocks))
+
+    def forward(self, rgb: Tensor) -> list[Tensor]:
+        """Features of one image; sides that are no multiple of 8 are padded by repeating their last pixels."""
+        height, width = rgb.shape[-2:]
+        image = F.pad(rgb[None].clamp(0, 1), (0, -width % 8, 0, -height % 8), mode="replicate")
+        features = []
+        for _ in range(self.SIZES):
+            code = self.codec.encode_rgb(image)
+            others = sum(count for modality, count in self.codec.channels.items() if modality != "rgb")
+            latent = torch.cat([code, code.new_zeros(1, others, *code.shape[-2:])], 1)
+            x = self.codec.enter(latent.contiguous(memory_format=torch.channels_last))  # as the codec's norms want it
+            features.append(x[0])
+            for block in self.codec.blocks:
+                x = block(x)
+                features.append(x[0])
+            image = F.avg_pool2d(image, 2)
+        return features
+
+
+WHOLE_PIXELS: Final = 2_500_000
+"""Images of up to this many pixels (1920 x 1280 is just below) are compared in one piece."""
+BAND_PIXELS: Final = 300_000
+LARGEST_PIXELS: Final = 2_500_000
+"""Larger images are halved until they have no more, before they are compared in the features of the codec."""
+LpipsTrunk = Literal["alex", "vgg", "squeeze"]
+LpipsInput = Literal["correct", "unscaled"]
+
+
+class _Layer(NamedTuple):
+    """A convolution with ReLU: place in the trunk, channels out and in, kernel, stride, padding."""
+
+    place: str
+    out: int
+    into: int
+    size: int = 3
+    stride: int = 1
+    padding: int = 1
+
+
+class _Fire(NamedTuple):
+    """SqueezeNet's block: place in the trunk, channels in, between, and out of each of its two branches."""
+
+    place: str
+    into: int
+    between: int
+    each: int
+
+    def layers(self) -> tuple[_Layer, _Layer, _Layer]:
+        """What squeezes, and both branches."""
+        return (
+            _Layer(f"{self.place}.squeeze", self.between, self.into, 1, 1, 0),
+            _Layer(f"{self.place}.expand1x1", self.each, self.between, 1, 1, 0),
+            _Layer(f"{self.place}.expand3x3", self.each, self.between),
+        )
+
+
+class _Maximum(NamedTuple):
+    """Maxima over squares at every second place; ``whole``: squares that reach over the edge count, too."""
+
+    size: int
+    whole: bool = False
+
+
+_Stage = tuple[_Layer | _Fire | _Maximum, ...]
+_POOL, _SQUEEZE_POOL = _Maximum(3), _Maximum(3, whole=True)
+
+
+def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
+    """Convolutions from a place of VGG-16 on; ``channels``: in, then out of each."""
+    pairs = zip(channels[:-1], channels[1:], strict=True)
+    return tuple(_Layer(str(first + 2 * number), out, into) for number, (into, out) in enumerate(pairs))
+
+
+TRUNKS: Final[dict[LpipsTrunk, tuple[_Stage, ...]]] = {
+    "alex": (
+        (_Layer("0", 64, 3, 11, 4, 2),), (_POOL, _Layer("3", 192, 64, 5, 1, 2)), (_POOL, _Layer("6", 384, 192)), (_Layer("8", 256, 384),),
+        (_Layer("10", 256, 256),),
+    ),
+    "vgg": (
+        _vgg(0, (3, 64, 64)), (_Maximum(2), *_vgg(5, (64, 128, 128))), (_Maximum(2), *_vgg(10, (128, 256, 256, 256))),
+        (_Maximum(2), *_vgg(17, (256, 512, 512, 512))), (_Maximum(2), *_vgg(24, (512, 512, 512, 512))),
+    ),
+    "squeeze": (
+        (_Layer("0", 64, 3, 3, 2, 0),), (_SQUEEZE_POOL, _Fire("3", 64, 16, 64), _Fire("4", 128, 16, 64)),
+        (_SQUEEZE_POOL, _Fire("6", 128, 32, 128), _Fire("7", 256, 32, 128)), (_SQUEEZE_POOL, _Fire("9", 256, 48, 192)),
+        (_Fire("10", 384, 48, 192),), (_Fire("11", 384, 64, 256),), (_Fire("12", 512, 64, 256),),
+    ),
+}  # fmt: skip
+"""Stages of each network; features are read after each. Places are those of torchvision's networks."""
+WIDTHS: Final[dict[LpipsTrunk, tuple[int, ...]]] = {
+    "alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512), "squeeze": (64, 128, 256, 384, 384, 512, 512),
+}  # fmt: skip
+
+
+def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of the tensors of a network of LPIPS, as the lpips package names them."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for number, stage in enumerate(TRUNKS[trunk]):
+        for layer in _layers(stage):
+            named = f"net.slice{number + 1}.{layer.place}"
+            shapes |= {f"{named}.weight": (layer.out, layer.into, layer.size, layer.size), f"{named}.bias": (layer.out,)}
+        shapes[f"lin{number}.model.1.weight"] = (1, WIDTHS[trunk][number], 1, 1)
+    return shapes
+
+
+def _layers(stage: _Stage) -> Iterator[_Layer]:
+    for step in stage:
+        if isinstance(step, _Layer):
+            yield step
+        elif isinstance(step, _Fire):
+            yield from step.layers()
+
+
+class LpipsFeatures(nn.Module):
+    """A trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
+
+    Args:
+        state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other entries are left alone.
+        where: file name for errors.
+        trunk: AlexNet, VGG-16 or SqueezeNet 1.1.
+        given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code of Gaussian scenes.
+
+    Raises:
+        InputError: a tensor is missing or has another shape.
+    """
+
+    SHIFT: Final = (-0.030, -0.088, -0.188)
+    SCALE: Final = (0.458, 0.448, 0.450)
+    SMALLEST_PX: Final = 31
+
+    def __init__(
+        self, state: Mapping[str, Tensor], where: str = "LPIPS weights", trunk: LpipsTrunk = "alex", given: LpipsInput = "correct"
+    ) -> None:
+        super().__init__()
+        self.trunk: LpipsTrunk = trunk
+        self.given: LpipsInput = given
+        self.register_buffer("shift", torch.tensor(self.SHIFT).view(1, 3, 1, 1))
+        self.register_buffer("scale", torch.tensor(self.SCALE).view(1, 3, 1, 1))
+        for name, shape in lpips_shapes(trunk).items():
+            self.register_buffer(name.replace(".", "/"), _tensor(state, name, shape, where))
+
+    @property
+    def channel_weights(self) -> list[Tensor]:
+        """Weights per channel, by stage."""
+        return [self.get_buffer(f"lin{stage}/model/1/weight").flatten() for stage in range(len(TRUNKS[self.trunk]))]
+
+    def forward(self, rgb: Tensor) -> list[Tensor]:
+        """Features ``[C, h, w]`` of the stages of an image ``[3, H, W]`` in [0, 1], at least 31 pixels a side."""
+        if min(rgb.shape[-2:]) < self.SMALLEST_PX:
+            size = f"{rgb.shape[-1]}x{rgb.shape[-2]}"
+            raise InputError("an image is too small for LPIPS", expected=f"{self.SMALLEST_PX} pixels a side", got=size)
+        x = rgb[None].clamp(0, 1)
+        x = ((x * 2 - 1 if self.given == "correct" else x) - self.shift) / self.scale
+        features = []
+        for number, stage in enumerate(TRUNKS[self.trunk]):
+            for step in stage:
+                if isinstance(step, _Maximum):
+                    x = F.max_pool2d(x, step.size, 2, ceil_mode=step.whole)
+                elif isinstance(step, _Fire):
+                    squeeze, *branches = step.layers()
+                    x = self._convolved(number, squeeze, x)
+                    x = torch.cat([self._convolved(number, branch, x) for branch in branches], 1)
+                else:
+                    x = self._convolved(number, step, x)
+            features.append(x[0])
+        return features
+
+    def _convolved(self, stage: int, layer: _Layer, x: Tensor) -> Tensor:
+        path = f"net/slice{stage + 1}/{layer.place.replace('.', '/')}"
+        kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
+        return F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
+
+
+def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], where: str) -> Tensor:
+    found = state.get(name)
+    if found is None or tuple(found.shape) != shape:
+        got = "missing" if found is None else str(tuple(found.shape))
+        raise InputError("LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got)
+    return found.float()
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Rows of a large image whose features are made together.
+
+    Args:
+        begins, ends: rows that count. above, below: rows that are read besides, for features at the border to be as in the whole.
+    """
+
+    begins: int
+    ends: int
+    above: int
+    below: int
+
+    def features(self, network: CodecFeatures, rgb: Tensor) -> list[Tensor]:
+        """The features of the rows that count, per stage ``[C, h, w]``."""
+        made = network(rgb[:, self.begins - self.above : self.ends + self.below])
+        rows = self.ends - self.begins + self.above + self.below
+        places = [_places(stage.shape[-2], rows, network.STEP) for stage in made]
+        counted = _padded(self.ends - self.begins, network.STEP)
+        return [f[:, self.above // p :][:, : counted // p] for f, p in zip(made, places, strict=True)]
+
+
+def _places(count: int, rows: int, step: int) -> int:
+    """Rows of the image, padded to a multiple of ``step``, that one row of features stands for."""
+    return _padded(rows, step) // count
+
+
+def _padded(rows: int, step: int) -> int:
+    return rows + -rows % step
+
+
+def _bands(height: int, width: int, network: CodecFeatures) -> list[_Band]:
+    """An image cut so that a band takes less than 1 GB at any width."""
+    step, reach = network.STEP, network.reach_rows
+    rows = max(step, BAND_PIXELS // width // step * step)
+    cuts = [*range(0, height, rows), height]
+    return [_Band(a, b, min(a, reach), min(height - b, reach)) for a, b in itertools.pairwise(cuts)]
+
+
+def reduced(image: Tensor) -> Tensor:
+    """A large image ``[C, H, W]`` brought to at most ``LARGEST_PIXELS`` by halving it, areas averaged."""
+    while image.shape[-2] * image.shape[-1] > LARGEST_PIXELS:
+        image = F.avg_pool2d(image[None], 2, ceil_mode=True, count_include_pad=False)[0]
+    return image
+
+
+class PerceptualDistance:
+    """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
+
+    The same truth is compared with one method after another: each thread keeps its features until another truth comes. Pairs come on the
+    CPU; what is compared goes to the device of the network here, and the number comes back.
+    """
+
+    def __init__(self, features: nn.Module, weights: list[Tensor] | None = None, device: torch.device | None = None) -> None:
+        self._device = device or torch.device("cpu")
+        self._features = features.to(self._device)
+        self._weights = None if weights is None else [weight.to(self._device) for weight in weights]
+        self._known = threading.local()
+
+    def __call__(self, pair: Pair) -> float | None:
+        """The distance, or None where colour is missing."""
+        if pair.rgb is None or pair.truth_rgb is None:
+            return None
+        if self.in_bands(pair):
+            return self.of_all([pair], 1)[0]
+        with torch.no_grad():
+            if getattr(self._known, "image", None) is not pair.truth_rgb:
+                self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
+                self._known.image = pair.truth_rgb
+            made, mask = self._features(pair.rgb.to(self._device)), None if pair.mask is None else pair.mask.to(self._device)
+            distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
+            return float(distance)
+
+    def in_bands(self, pair: Pair) -> bool:
+        """Whether images of this size are compared band by band: no machine should hold all features of them at once."""
+        if pair.rgb is None or pair.truth_rgb is None or not isinstance(self._features, CodecFeatures):
+            return False
+        return pair.rgb.shape[-2] * pair.rgb.shape[-1] > WHOLE_PIXELS
+
+    def of_all(self, pairs: Sequence[Pair], threads: int) -> list[float]:
+        """The distances of large images (``in_bands``) from one truth, whose features are made once for all of them.
+
+        Args:
+            pairs: of one truth and mask. threads: bands that are worked on at the same time; the values do not depend on it.
+        """
+        network, truth, mask = self._features, pairs[0].truth_rgb, pairs[0].mask
+        if truth is None or not isinstance(network, CodecFeatures):
+            raise UsageError("only distances in the features of the codec are made band by band", where="PerceptualDistance.of_all")
+        images = [reduced(pair.rgb) for pair in pairs if pair.rgb is not None]
+        given = _Compared(network, self._device, images, reduced(truth), None if mask is None else reduced(mask.float()))
+        height, width = given.truth.shape[-2:]
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(given.sums_of, _bands(height, width, network)))
+        return [_mean_of_stages(bands) for bands in zip(*parts, strict=True)]
+
+
+def _mean_of_stages(bands: Sequence[Sequence[tuple[float, float]]]) -> float:
+    """The distance of one image from sums of distances and weights by band and stage."""
+    stages = [[sum(numbers) for numbers in zip(*stage, strict=True)] for stage in zip(*bands, strict=True)]
+    return sum(apart / weight if weight else math.nan for apart, weight in stages) / len(stages)
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Images that are held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H, W]."""
+
+    network: CodecFeatures
+    device: torch.device
+    images: Sequence[Tensor]
+    truth: Tensor
+    mask: Tensor | None
+    shares: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+
+    @torch.no_grad()
+    def sums_of(self, band: _Band) -> list[list[tuple[float, float]]]:
+        """Of every image and stage: sum of the weighted distances in a band, and of the weights."""
+        true = unit_features(band.features(self.network, self.truth.to(self.device)))
+        shares = [self._share(band, features) for features in true]
+        return [
+            [
+                (float((places * share).double().sum()), float(share.expand_as(places).double().sum()))
+                for features, target, share in zip(band.features(self.network, image.to(self.device)), true, shares, strict=True)
+                for places in [distance_places(features, target)]
+            ]
+            for image in self.images
+        ]
+
+    def _share(self, band: _Band, features: Tensor) -> Tensor:
+        """Weight of every place of a stage's features in a band."""
+        if self.mask is None:
+            return features.new_ones(())
+        step, height = self.network.STEP, self.truth.shape[-2]
+        per_row = _places(features.shape[-2], band.ends - band.begins, step)
+        size = (_padded(height, step) // per_row, features.shape[-1])
+        if size not in self.shares:
+            self.shares[size] = F.adaptive_avg_pool2d(self.mask.to(self.device, torch.float32), size)[0]
+        return self.shares[size][band.begins // per_row :][: features.shape[-2]]

@@ -1,0 +1,210 @@
+"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache; nothing is
+downloaded, and a folder is read completely or not at all.
+
+The packages are extras, imported at first use. Which class reads a folder is decided by our tables: no name in a
+file becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the network
+has and the folder lacks is an error, where the packages would leave it random and say so in a log.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mudg.base import store
+from mudg.base.devices import NETWORK_KINDS, DeviceName, choose_device
+from mudg.base.errors import InputError, ResourceError
+
+# the check that every network of a score makes of its weights ---------------------------------------------------------
+
+
+def checked_state(
+    state: Mapping[str, Tensor],
+    wanted: Mapping[str, tuple[int, ...]],
+    where: str,
+    network: str,
+    ignored: Callable[[str], bool],
+) -> dict[str, Tensor]:
+    """The wanted tensors of a file as float32.
+
+    Args:
+        wanted: name -> shape of all that the network needs. where: file name for errors. network: its name. ignored: names that may be
+            there and are not read; all other names are refused.
+
+    Raises:
+        InputError: a tensor is missing, has another shape, holds values that are not finite, or is unknown.
+    """
+    for name, shape in wanted.items():
+        found = state.get(name)
+        if found is None or tuple(found.shape) != shape or not found.is_floating_point():
+            got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
+            raise InputError(
+                f"{network} weights are incomplete or of another network",
+                where=f"{where}: {name}",
+                expected=str(shape),
+                got=got,
+            )
+        if not bool(torch.isfinite(found).all()):
+            raise InputError(f"{network} weights hold values that are not finite", where=f"{where}: {name}")
+    for name in state:
+        if name not in wanted and not ignored(name):
+            raise InputError(f"{network} weights hold a tensor that the network has not", where=f"{where}: {name}",
+                expected=f"{len(wanted)} tensors")  # fmt: skip
+    return {name: state[name].detach().float() for name in wanted}
+
+
+# folders --------------------------------------------------------------------------------------------------------------
+
+
+_REMEDY: Final = "pip install 'mudg[models]'"
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Device of a network, one that `choose_device` accepts, and whether its convolutions and matrix products are computed in bfloat16."""
+
+    device: DeviceName = "cpu"
+    bf16: bool = False
+
+    def ready(self) -> torch.device:
+        """The device; UsageError, ResourceError where there is none of the kind."""
+        return choose_device(self.device, "networks of annotate", NETWORK_KINDS)
+
+    def autocast(self) -> torch.autocast:
+        """Context in which a network shall run."""
+        return torch.autocast(self.device.partition(":")[0], torch.bfloat16, enabled=self.bf16)
+
+
+CPU: Final = Place()
+MEAN: Final = (0.485, 0.456, 0.406)
+DEVIATION: Final = (0.229, 0.224, 0.225)
+"""Statistics of colours in 0..1 (ImageNet) where a folder names none."""
+
+
+def normalized(rgb: NDArray[np.uint8], mean: Sequence[float], deviation: Sequence[float]) -> Tensor:
+    """Image u8[H, W, 3] as f32[1, 3, H, W] with the mean and deviation of its colours in 0..1 taken out."""
+    image = torch.from_numpy(rgb).permute(2, 0, 1)[None].float() / 255
+    offset, scale = (torch.tensor(numbers)[None, :, None, None] for numbers in (mean, deviation))
+    return (image - offset) / scale
+
+
+_IN_HUB: Final = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?")
+
+
+def find(name: str | Path) -> Path:
+    """Folder of a network: ``name`` itself where it is a folder, else the copy of the repository "owner/name" or "owner/name@revision"
+    that lies in the Hugging Face cache of this machine. Nothing is downloaded.
+
+    Raises:
+        ResourceError: neither is there, or the package that knows the cache is missing.
+    """
+    text = str(name)
+    parts = _IN_HUB.fullmatch(text)
+    if Path(name).is_dir() or parts is None:
+        return Path(name)
+    try:
+        hub = package("huggingface_hub")
+    except ResourceError as error:
+        raise ResourceError("no such folder, nor the package that knows the Hugging Face cache", where=text,
+            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}") from error  # fmt: skip
+    try:
+        found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
+    except (OSError, ValueError) as error:
+        raise ResourceError("no such folder, and no copy of such a repository in the Hugging Face cache", where=text,
+            got=str(error).splitlines()[0], expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}",
+            remedy=f"hf download {parts['repository']}") from error  # fmt: skip
+    return Path(found)
+
+
+def title(folder: str | Path) -> str:
+    """Name of a folder in notes: "owner/name@revision" of one in the Hugging Face cache, else its own name."""
+    path = Path(folder)
+    parent = path.parent.parent.name
+    if path.parent.name == "snapshots" and parent.startswith("models--"):
+        return f"{parent.removeprefix('models--').replace('--', '/', 1)}@{path.name[:12]}"
+    return path.name
+
+
+def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> ModuleType:
+    """A package that reads folders, with its progress bars off; ResourceError names the extra if it is missing."""
+    try:
+        match name:
+            case "transformers":
+                found = importlib.import_module("transformers")
+            case "diffusers":
+                found = importlib.import_module("diffusers")
+            case "huggingface_hub":
+                found = importlib.import_module("huggingface_hub")
+    except ImportError as error:
+        raise ResourceError(f"the {name} package is missing", where="pretrained network", got=str(error),
+            remedy=_REMEDY) from error  # fmt: skip
+    return _quiet(found)
+
+
+def _quiet(found: ModuleType) -> ModuleType:
+    """Progress bars of the package would run through ours."""
+    switch = getattr(getattr(getattr(found, "utils", None), "logging", None), "disable_progress_bar", None)
+    if switch is not None:
+        switch()
+    return found
+
+
+def member(owner: ModuleType, class_name: str) -> Any:
+    """A class of a package; ResourceError where the installed version is too old to have it."""
+    found = getattr(owner, class_name, None)
+    if found is None:
+        raise ResourceError(f"the installed {owner.__name__} package has no {class_name}", where="pretrained network",
+            expected="a newer version", got=str(getattr(owner, "__version__", "")),
+            remedy=f"pip install --upgrade {owner.__name__}")  # fmt: skip
+    return found
+
+
+def read_settings(file: Path) -> dict[str, Any]:
+    """A JSON object of a folder; InputError where there is none."""
+    content = store.read_json(file)
+    if not isinstance(content, dict):
+        raise InputError("the description of a network is no JSON object", where=str(file), got=type(content).__name__)
+    return content
+
+
+def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder: str = "") -> nn.Module:
+    """A network with all its weights, in float32 on its device, ready for use; its parameters have no gradient.
+
+    Args:
+        network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it.
+        place: where it shall compute. subfolder: part of the folder that holds this network.
+
+    Raises:
+        InputError: the folder does not hold this network, or not all of it. ResourceError: no such device.
+    """
+    device = place.ready()
+    where = str(folder / subfolder)
+    options: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+    if subfolder:
+        options["subfolder"] = subfolder
+    if network_class.__module__.split(".")[0] == "diffusers":
+        options["low_cpu_mem_usage"] = False  # what saves memory there needs one more package
+    try:
+        network, report = network_class.from_pretrained(str(folder), **options)
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(f"the folder cannot be read as {network_class.__name__}", where=where, got=lines[0][:300],
+            expected="the configuration and the safetensors file that save_pretrained writes") from error  # fmt: skip
+    lacking = sorted(str(name) for key in ("missing_keys", "mismatched_keys") for name in report.get(key) or ())
+    if lacking:
+        raise InputError(f"weights of the {network_class.__name__} are missing, or have another shape", where=where,
+            expected="a value for every parameter", got=", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else ""),
+            remedy="take the folder of the whole network, with its task's head")  # fmt: skip
+    if any(value.dtype != torch.float32 for value in network.parameters()):
+        network = network.float()
+    return network.to(device).eval().requires_grad_(False)

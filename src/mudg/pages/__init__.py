@@ -1,1 +1,0 @@
-"""Pages, videos, contact sheets and tables made from results."""

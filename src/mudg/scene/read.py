@@ -1,0 +1,195 @@
+"""Reading scenes: the index at once, images and points when they are needed (labels: ``labels.py``)."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from mudg.base import palette, store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Frame, Ref, Scene, Sweep, SweepPoints
+from mudg.scene import schema
+from mudg.scene.files import READABLE, open_files
+
+_EXIF_ORIENTATION: Final = 0x0112
+_PNG: Final = b"\x89PNG"
+
+
+def read_scene(path: Path | str) -> Scene:
+    """Read and check a scene; images, points and labels stay on disk until asked for.
+
+    Args:
+        path: a scene directory, or a stored zip of one.
+
+    Raises:
+        InputError: a record, reference or relation is wrong, or a referenced file is missing.
+        IntegrityError: a file differs from the scene's manifest.
+    """
+    return load_scene(path, schema.raise_first)
+
+
+def load_scene(path: Path | str, complain: schema.Complain) -> Scene:
+    """``read_scene`` with a choice of what happens to a problem (see ``schema.py``)."""
+    files = open_files(path)
+    where = f"{files.root}: scene.json" if Path(path).is_file() else str(Path(path) / "scene.json")
+    scene_json = schema.parse_object(files.read("scene.json"), where)
+    tracks_json = None
+    if files.problem("tracks.json") is None:
+        tracks_json = schema.parse_object(files.read("tracks.json"), where.replace("scene.json", "tracks.json"))
+    scene = schema.parse_scene(scene_json, tracks_json, files.root, where, complain)
+    named: dict[str, str] = {}
+    for owner, ref in all_refs(scene):
+        problem = files.problem(ref.path)
+        if problem is not None:
+            remedy = "restore the file, remove the record, or ingest the log again"
+            complain(InputError(problem, where=f"{where}: {owner}", expected=READABLE, got=ref.path, remedy=remedy))
+        if named.setdefault(ref.path, owner) != owner:
+            got = f"{ref.path}, also in {named[ref.path]}"
+            complain(InputError("two records name the same file", where=f"{where}: {owner}", got=got))
+    return scene
+
+
+def all_refs(scene: Scene) -> list[tuple[str, Ref]]:
+    """Every file reference of a scene, each with the name of its owner."""
+    refs = [(f"frame {frame.id} image", frame.image) for frame in scene.frames]
+    refs += [(f"frame {frame.id} label {name}", ref) for frame in scene.frames for name, ref in frame.labels.items()]
+    return refs + [(f"sweep {sweep.id}", sweep.points) for sweep in scene.sweeps]
+
+
+def read_image(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
+    """The recorded image, u8[H, W, 3] RGB. Grey images are repeated on three channels.
+
+    Raises:
+        InputError: missing, truncated, not 8-bit, or not of the camera's size.
+    """
+    content = open_files(scene.root).read(frame.image.path)
+    return decode_image(content, f"{scene.root}: {frame.image.path}", frame.view.camera)
+
+
+def decode_image(content: bytes, where: str, camera: Camera | None = None) -> NDArray[np.uint8]:
+    """Decode PNG or JPEG bytes to u8[H, W, 3]; the size is compared with ``camera`` before anything is unpacked."""
+    with _opened(content, where, camera) as image:
+        return np.array(image.convert("RGB"))
+
+
+def check_image(content: bytes, where: str, camera: Camera | None = None) -> bool:
+    """Refuse PNG or JPEG bytes that ``decode_image`` would refuse, at less cost; returns whether the image is grey.
+
+    All data are read. Of a JPEG they are turned into a picture of an eighth of the size, a tenth of the work; a PNG's
+    checksums are compared, too, which decoding leaves out.
+    """
+    if content[:4] == _PNG:
+        with _explained(content, where), Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+            image.verify()
+    with _opened(content, where, camera) as image:
+        grey = image.mode == "L"
+        if image.format == "JPEG":
+            image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
+        image.load()
+        return grey
+
+
+def is_grey(content: bytes, where: str, camera: Camera) -> bool:
+    """``check_image`` of the header alone, for bytes that are known to be as they were written."""
+    with _opened(content, where, camera) as image:
+        return image.mode == "L"
+
+
+@contextlib.contextmanager
+def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image.Image]:
+    """An opened image of a kind that scenes hold; what goes wrong with it in the block becomes an InputError."""
+    with _explained(content, where), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+        if camera is not None and image.size != (camera.width, camera.height):
+            raise InputError(
+                "image does not have its camera's size", where=where, got=f"{image.width}x{image.height}",
+                expected=f"{camera.width}x{camera.height}",
+                remedy="correct the camera's size and intrinsics, or the image",
+            )  # fmt: skip
+        if max(image.size) > schema.MAX_IMAGE_SIDE_PX:
+            raise InputError("image is too large", where=where, got=f"{image.width}x{image.height}")
+        if image.getexif().get(_EXIF_ORIENTATION, 1) != 1:
+            what, remedy = "image is stored rotated (EXIF orientation)", "apply the rotation and write the image again"
+            raise InputError(what, where=where, expected="upright pixels", remedy=remedy)
+        sixteen_bits = content[:4] == _PNG and content[24:25] == b"\x10"  # Pillow would drop the lower half
+        if image.mode not in ("RGB", "L", "P", "RGBA") or sixteen_bits:
+            got = "16 bits a channel" if sixteen_bits else f"mode {image.mode}"
+            raise InputError(
+                "image is not 8-bit RGB or grey", where=where, expected="8 bits a channel", got=got,
+                remedy="convert it to 8-bit RGB",
+            )  # fmt: skip
+        if image.mode == "RGBA" and image.getchannel("A").getextrema() != (255, 255):
+            raise InputError("image has transparent pixels", where=where, expected="an opaque image")
+        yield image
+
+
+@contextlib.contextmanager
+def _explained(content: bytes, where: str) -> Iterator[None]:
+    """Make what Pillow raises an InputError."""
+    try:
+        yield
+    except UnidentifiedImageError as error:
+        got = f"{len(content)} bytes starting {content[:12]!r}" if content else "an empty file"
+        remedy = "is it an empty or placeholder file? copy it again"
+        raise InputError("file is not a PNG or JPEG image", where=where, got=got, remedy=remedy) from error
+    except Image.DecompressionBombError as error:
+        remedy = "is its header damaged? copy the file again"
+        raise InputError("image is too large", where=where, got=str(error)[:120], remedy=remedy) from error
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        what, got = "image cannot be decoded (is it cut off?)", f"{error} after {len(content)} bytes"
+        raise InputError(what, where=where, got=got, remedy="copy the file again") from error
+
+
+def read_points(scene: Scene, sweep: Sweep) -> SweepPoints:
+    """The points of a sweep in the LiDAR frame. A sweep with zero points is a sweep with zero points, not an error.
+
+    Raises:
+        InputError: missing, truncated, wrong tensors, or NaN coordinates.
+    """
+    where = f"{scene.root}: {sweep.points.path}"
+    arrays = store.parse_safetensors(open_files(scene.root).read(sweep.points.path), where)
+    for name in ("xyz", "intensity", "dt_s"):
+        if name not in arrays:
+            expected, got = "xyz, intensity, dt_s", ", ".join(arrays) or "nothing"
+            raise InputError(f"sweep has no tensor {name!r}", where=where, expected=expected, got=got)
+    return checked_points(arrays, where)
+
+
+def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoints:
+    """Points from the arrays ``xyz``, ``intensity``, ``dt_s`` and, if there, ``classes``.
+
+    Raises:
+        InputError: wrong shape or type, values that are not finite, or classes that are no train ids.
+    """
+    count, classes = len(arrays["xyz"]), arrays.get("classes")
+    for name, shape in (("xyz", (count, 3)), ("intensity", (count,)), ("dt_s", (count,))):
+        array = arrays[name]
+        if array.shape != shape or array.dtype != np.float32:
+            expected, got = f"float32 {shape}", f"{array.dtype} {array.shape}"
+            raise InputError(f"sweep tensor {name!r} has the wrong form", where=where, expected=expected, got=got)
+        if not np.isfinite(array).all():
+            bad = int((~np.isfinite(array.reshape(count, -1)).all(1)).sum())
+            raise InputError(
+                "sweep holds values that are not finite", where=f"{where}: {name}", got=f"{bad} of {count} points",
+                expected="finite metres", remedy="drop missing returns when importing",
+            )  # fmt: skip
+    if classes is not None:
+        _check_classes(classes, count, f"{where}: classes")
+    return SweepPoints(arrays["xyz"], arrays["intensity"], arrays["dt_s"], classes)
+
+
+def _check_classes(classes: NDArray[Any], count: int, where: str) -> None:
+    """Refuse classes of points that are not u8[count] train ids or ``UNLABELLED``."""
+    if classes.shape != (count,) or classes.dtype != np.uint8:
+        expected, got = f"uint8 ({count},)", f"{classes.dtype} {classes.shape}"
+        raise InputError("sweep tensor 'classes' has the wrong form", where=where, got=got, expected=expected)
+    wrong = np.unique(classes[(classes >= len(palette.CLASSES)) & (classes != palette.UNLABELLED)])
+    if len(wrong):
+        expected, got = "0..18 or 255 (unlabelled)", str(wrong[:8].tolist())
+        raise InputError("classes of points hold values that are no train id", where=where, expected=expected, got=got)

@@ -1,0 +1,497 @@
+"""``scene.json`` and ``tracks.json``: what a record may hold, parsing into the types of ``base/types.py``, and the text written.
+
+Every refusal is an ``InputError`` that names file, record and field, says what was expected and found, and what to do.
+Parsers take ``complain``: the reader passes a function that raises at the first problem, ``mudg doctor`` passes one that
+collects them all, so that a person sees every mistake of a hand-made scene at once.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
+
+from mudg.base import store
+from mudg.base.errors import InputError
+from mudg.base.records import Number, StrictRecord, after, checked_by, named_by, parse_record, place, refuse_unknown
+from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, Track, View, increasing_problem
+
+FORMAT: Final = "mudg-scene"
+TRACKS_FORMAT: Final = "mudg-tracks"
+SCHEMA_VERSION: Final = 1
+MAX_IMAGE_SIDE_PX: Final = 32768
+MAX_BOX_SIDE_M: Final = 200.0
+
+LABEL_NAMES: Final = (
+    "depth", "semantics", "sky", "ego", "dynamic", "instance", "semantics_confidence", "depth_confidence",
+    "rendered",
+)  # fmt: skip
+"""Labels a frame may carry; see ``read_label`` for the array each of them is."""
+
+NAME_PATTERN: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-+]{0,63}")
+"""Names that become folders: cameras, sensors."""
+
+Complain = Callable[[InputError], None]
+Parsed = TypeVar("Parsed")
+
+
+def raise_first(problem: InputError) -> None:
+    """The strict reader's answer to a problem."""
+    raise problem
+
+
+def parse_object(data: bytes, where: str) -> dict[str, Any]:
+    """Parse one strict JSON object (no NaN, no duplicate keys, an object at the top); InputError names ``where``."""
+    parsed = store.parse_json(data, where)
+    if not isinstance(parsed, dict):
+        got = type(parsed).__name__
+        raise InputError("the top of the file is not an object", where=where, expected="{...}", got=got)
+    return parsed
+
+
+# --- fields ---------------------------------------------------------------------------------------------------------
+
+
+def ref_problem(text: object) -> str | None:
+    """Say why ``text`` is no acceptable file reference inside a scene, or return None.
+
+    Accepted: relative POSIX paths of plain components. Refused: absolute paths, ``.``/``..``, empty components,
+    backslashes, colons (drive letters, streams), control characters, components ending in a dot or space.
+    """
+    if not isinstance(text, str) or not text:
+        return "is not a non-empty text"
+    if len(text) > 400:
+        return "is longer than 400 characters"
+    if any(ord(character) < 32 or ord(character) == 127 for character in text):
+        return "contains control characters"
+    if "\\" in text:
+        return "contains a backslash (references use forward slashes)"
+    if ":" in text:
+        return "contains a colon (drive letters and streams are not allowed)"
+    if text.startswith("/"):
+        return "is absolute (references are relative to the scene)"
+    for component in text.split("/"):
+        if component in ("", ".", ".."):
+            return f"contains the component {component!r}"
+        if component[-1] in ". ":
+            return f"has the component {component!r} that ends in a dot or space"
+    return None
+
+
+def check_ref(value: str) -> str:
+    """A file reference inside the scene, else InputError."""
+    problem = ref_problem(value)
+    if problem is not None:
+        expected = "a relative path inside the folder, e.g. images/front/000000.png"
+        raise InputError(f"file reference {problem}", expected=expected, got=repr(value)[:120])
+    return value
+
+
+def check_name(value: str, where: str = "") -> str:
+    """A camera or sensor name that can be a folder name, else InputError."""
+    if not NAME_PATTERN.fullmatch(value) or value.endswith("."):
+        expected = "1-64 letters, digits or _ . - + starting with a letter or digit"
+        raise InputError("name cannot be a folder name", where=where, expected=expected, got=repr(value)[:80])
+    return value
+
+
+def check_frame_id(frame_id: str, sensor: str, where: str) -> None:
+    """A frame's or sweep's id is ``<sensor>/<digits>``, else InputError."""
+    name, _, number = frame_id.rpartition("/")
+    if name != sensor or not re.fullmatch("[0-9]{1,12}", number):
+        expected, got = f"{sensor}/000012", repr(frame_id)[:80]
+        raise InputError("frame id does not fit its camera", where=where, expected=expected, got=got)
+
+
+def check_box_size(size_m: list[float]) -> list[float]:
+    """Length, width and height of a box, else InputError."""
+    if len(size_m) != 3 or not all(0 < side < MAX_BOX_SIDE_M for side in size_m):
+        expected = f"[length, width, height] in metres, each above 0 and below {MAX_BOX_SIDE_M:g}"
+        raise InputError("box size makes no sense", expected=expected, got=str(size_m)[:80])
+    return size_m
+
+
+def sixteen_numbers(value: Any) -> list[Any]:
+    """A 3x4 or 4x4 matrix, flat or in rows, as 16 values row by row."""
+    numbers = value
+    if isinstance(value, list) and len(value) in (3, 4) and all(isinstance(row, list) for row in value):
+        numbers = [number for row in value for number in row]
+    if not isinstance(numbers, list) or len(numbers) not in (12, 16):
+        expected = "12 or 16 numbers, row by row (world metres)"
+        raise InputError("pose is not a 3x4 or 4x4 matrix", expected=expected, got=_describe_shape(value))
+    return numbers if len(numbers) == 16 else [*numbers, 0.0, 0.0, 0.0, 1.0]
+
+
+def _describe_shape(value: object) -> str:
+    if not isinstance(value, list):
+        return type(value).__name__
+    lengths = {len(item) if isinstance(item, list) else 0 for item in value}
+    return f"a list of {len(value)}" + (f" lists of length {sorted(lengths)}" if lengths - {0} else " values")
+
+
+def _known_labels(value: Any) -> Any:
+    if isinstance(value, dict):
+        refuse_unknown(value, LABEL_NAMES)
+    return value
+
+
+FileRef = Annotated[str, after(check_ref)]
+Name = Annotated[str, after(check_name)]
+PoseNumbers = Annotated[list[Number], BeforeValidator(checked_by(sixteen_numbers))]
+"""A matrix as 16 finite numbers. Whether it is rigid is checked by the type that is made of it."""
+BoxSize = Annotated[list[Number], after(check_box_size)]
+LabelRefs = Annotated[dict[str, FileRef], BeforeValidator(checked_by(_known_labels))]
+
+
+def matrices_of(poses: list[list[float]]) -> NDArray[np.float64]:
+    """f64[n, 4, 4] from n ``PoseNumbers``."""
+    return np.array(poses, np.float64).reshape(len(poses), 4, 4)
+
+
+# --- records --------------------------------------------------------------------------------------------------------
+
+
+class CameraEntry(StrictRecord):
+    """Intrinsics in pixels; the camera's name is its key."""
+
+    width: int
+    height: int
+    fx: Number
+    fy: Number
+    cx: Number
+    cy: Number
+    distortion: list[Number] = []
+    readout_s: Number = 0.0
+
+
+class FrameEntry(StrictRecord):
+    """One image."""
+
+    id: str
+    camera: str
+    time_s: Number
+    world_from_cam: PoseNumbers
+    image: FileRef
+    labels: LabelRefs = {}
+
+
+class SweepEntry(StrictRecord):
+    """One LiDAR sweep."""
+
+    id: str
+    sensor: Name
+    time_s: Number
+    world_from_lidar: PoseNumbers
+    points: FileRef
+
+
+class TrackEntry(StrictRecord):
+    """One tracked box."""
+
+    id: str
+    label: str
+    size_m: BoxSize
+    times_s: list[Number]
+    world_from_object: list[PoseNumbers]
+
+
+class EgoEntry(StrictRecord):
+    """The path of the vehicle."""
+
+    times_s: Annotated[list[Number], Field(min_length=1)]
+    world_from_ego: list[PoseNumbers]
+
+
+class SourceEntry(StrictRecord):
+    """Where the log comes from and under which licence."""
+
+    dataset: str
+    licence: str
+    recipe: dict[str, Any] | None = None
+    notes: list[str] = []
+
+
+class SceneIndex(StrictRecord):
+    """The top of ``scene.json``; frames and sweeps are checked one by one."""
+
+    format: str
+    schema_version: int
+    id: str
+    source: SourceEntry
+    cameras: dict[str, Any]
+    frames: list[Any]
+    ego: EgoEntry
+    sweeps: list[Any] = []
+    split: dict[str, Literal["train", "test"]] = {}
+    conventions: Any = None
+
+
+class TracksIndex(StrictRecord):
+    """The top of ``tracks.json``; tracks are checked one by one."""
+
+    format: str
+    schema_version: int
+    tracks: list[Any]
+
+
+def parse_camera(name: str, value: object, where: str) -> Camera:
+    """Parse and check one camera; InputError names ``where`` and the field."""
+    check_name(name, where)
+    record = parse_record(CameraEntry, value, where)
+    width, height, longest = record.width, record.height, max(record.width, record.height)
+    focal = "give the focal length in pixels, not millimetres, and not zero"
+    cropped = "check units and whether the image was cropped"
+    limits = (
+        ("width", "image size makes no sense", 1, MAX_IMAGE_SIDE_PX, ""),
+        ("height", "image size makes no sense", 1, MAX_IMAGE_SIDE_PX, ""),
+        ("fx", "focal length makes no sense", 0.01 * longest, 1000 * longest, focal),
+        ("fy", "focal length makes no sense", 0.01 * longest, 1000 * longest, focal),
+        ("cx", "principal point lies far outside the image", -width, 2 * width, cropped),
+        ("cy", "principal point lies far outside the image", -height, 2 * height, cropped),
+        ("readout_s", "rolling-shutter readout makes no sense", 0, 1, ""),
+    )
+    for key, what, least, most, remedy in limits:
+        value = getattr(record, key)
+        if not least <= value <= most:
+            expected = f"{least:g} to {most:g} {'s' if key == 'readout_s' else 'pixels'}"
+            raise InputError(what, where=place(where, key), expected=expected, got=f"{value:g}", remedy=remedy)
+    intrinsics = (record.fx, record.fy, record.cx, record.cy)
+    return Camera(name, width, height, *intrinsics, tuple(record.distortion), record.readout_s)
+
+
+def parse_frame(value: object, where: str, cameras: Mapping[str, Camera]) -> Frame:
+    """Parse one frame; its camera must be known."""
+    record = parse_record(FrameEntry, value, where)
+    camera = cameras.get(record.camera)
+    if camera is None:
+        what = f"frame names the camera {record.camera!r}, which the scene does not have"
+        expected = f"one of {', '.join(cameras)}"
+        raise InputError(what, where=place(where, "camera"), expected=expected, got=record.camera)
+    check_frame_id(record.id, camera.name, place(where, "id"))
+    with named_by(where):
+        view = View(camera, matrices_of([record.world_from_cam])[0], record.time_s)
+    labels = {name: Ref(record.labels[name]) for name in LABEL_NAMES if name in record.labels}
+    return Frame(record.id, view, Ref(record.image), labels)
+
+
+def parse_sweep(value: object, where: str) -> Sweep:
+    """Parse one LiDAR sweep record."""
+    record = parse_record(SweepEntry, value, where)
+    pose = matrices_of([record.world_from_lidar])[0]
+    with named_by(where):
+        return Sweep(record.id, record.sensor, record.time_s, pose, Ref(record.points))
+
+
+def parse_track(value: object, where: str) -> Track:
+    """Parse one tracked box."""
+    record = parse_record(TrackEntry, value, where)
+    size_m, times_s = np.array(record.size_m), np.array(record.times_s)
+    with named_by(where):
+        return Track(record.id, record.label, size_m, times_s, matrices_of(record.world_from_object))
+
+
+# --- whole files ----------------------------------------------------------------------------------------------------
+
+
+def parse_scene(
+    scene_json: dict[str, Any],
+    tracks_json: dict[str, Any] | None,
+    root: str,
+    where: str,
+    complain: Complain = raise_first,
+) -> Scene:
+    """Build a Scene from the two parsed files.
+
+    Args:
+        scene_json: content of ``scene.json``.
+        tracks_json: content of ``tracks.json``; None when the scene has none.
+        root: where the files lie (folder or zip), kept in the Scene.
+        where: path of ``scene.json`` for messages.
+        complain: called with each problem; raises in the strict reader. A record with a problem is left out.
+
+    Raises:
+        InputError: the frame of the file itself is wrong, or ``complain`` raised.
+    """
+    _check_format(scene_json, FORMAT, where)
+    top = parse_record(SceneIndex, scene_json, f"{where}: ")
+    if not top.cameras:
+        raise InputError("scene has no cameras", where=f"{where}: cameras", expected="at least one camera by name")
+    cameras = parse_table(top.cameras, f"{where}: cameras", parse_camera, complain)
+    frames = parse_each(top.frames, f"{where}: frames", lambda value, at: parse_frame(value, at, cameras), complain)
+    sweeps = parse_each(top.sweeps, f"{where}: sweeps", parse_sweep, complain)
+    tracks: list[Track] = []
+    if tracks_json is not None:
+        where_tracks = where.replace("scene.json", "tracks.json")
+        _check_format(tracks_json, TRACKS_FORMAT, where_tracks)
+        listed = parse_record(TracksIndex, tracks_json, f"{where_tracks}: ").tracks
+        tracks = parse_each(listed, f"{where_tracks}: tracks", parse_track, complain)
+    with named_by(f"{where}: ego"):
+        ego = EgoPath(np.array(top.ego.times_s), matrices_of(top.ego.world_from_ego))
+    source = Source(top.source.dataset, top.source.licence, top.source.recipe, tuple(top.source.notes))
+    split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **top.split}
+    scene = Scene(top.id, root, cameras, tuple(frames), tuple(sweeps), tuple(tracks), ego, split, source)
+    check_relations(scene, where, complain)
+    return scene
+
+
+def parse_each(
+    values: Iterable[Any], where: str, parse: Callable[[Any, str], Parsed], complain: Complain
+) -> list[Parsed]:
+    """Parse the records of a list at ``where``; one with a problem is complained about and left out."""
+    parsed = []
+    for index, value in enumerate(values):
+        try:
+            parsed.append(parse(value, f"{where}[{index}]"))
+        except InputError as problem:
+            complain(problem)
+    return parsed
+
+
+def parse_table(
+    table: Mapping[str, Any], where: str, parse: Callable[[str, Any, str], Parsed], complain: Complain
+) -> dict[str, Parsed]:
+    """Parse named records at ``where``; one with a problem is complained about and left out."""
+    parsed = {}
+    for name, value in table.items():
+        try:
+            parsed[name] = parse(name, value, f"{where}.{name}")
+        except InputError as problem:
+            complain(problem)
+    return parsed
+
+
+def _check_format(top: dict[str, Any], name: str, where: str) -> None:
+    found, version = repr(top.get("format"))[:80], repr(top.get("schema_version"))[:80]
+    if top.get("format") != name:
+        raise InputError(f"this is not a {name} file", where=where, expected=f'"format": "{name}"', got=found)
+    if top.get("schema_version") != SCHEMA_VERSION:
+        remedy = "ingest the log again with this version, or use the version that wrote it"
+        raise InputError(
+            "schema version is not one this program reads", where=f"{where}: schema_version",
+            expected=str(SCHEMA_VERSION), got=version, remedy=remedy,
+        )  # fmt: skip
+
+
+def repeated(names: Iterable[str]) -> list[str]:
+    """The names that occur more than once, sorted."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
+
+
+def check_relations(scene: Scene, where: str, complain: Complain = raise_first) -> None:
+    """Checks that span records: frames exist, ids are unique, times increase per sensor, the split names real frames."""
+    if not scene.frames:
+        complain(InputError("scene has no frames", where=f"{where}: frames", expected="at least one image"))
+    for kind, records in (("frames", scene.frames), ("sweeps", scene.sweeps), ("tracks", scene.tracks)):
+        twice = repeated(record.id for record in records)
+        if twice:
+            got = ", ".join(twice[:5])
+            complain(InputError("an id occurs twice", where=f"{where}: {kind}", got=got, expected="unique ids"))
+    times_by_sensor: dict[str, list[float]] = {}
+    for frame in scene.frames:
+        times_by_sensor.setdefault(f"frames of camera {frame.view.camera.name}", []).append(frame.view.time_s)
+    for sweep in scene.sweeps:
+        times_by_sensor.setdefault(f"sweeps of sensor {sweep.sensor}", []).append(sweep.time_s)
+    for sensor, times in times_by_sensor.items():
+        problem = increasing_problem(np.array(times))
+        if problem is not None:
+            expected, remedy = "seconds, strictly increasing per sensor", "sort the records by time"
+            place_of = f"{where}: {sensor}"
+            complain(InputError("times do not increase", where=place_of, got=problem, expected=expected, remedy=remedy))
+    known = {frame.id for frame in scene.frames}
+    unknown = [frame_id for frame_id in scene.split if frame_id not in known]
+    if unknown:
+        what, got = "split names frames that the scene does not have", ", ".join(unknown[:5])
+        complain(InputError(what, where=f"{where}: split", got=got))
+
+
+# --- writing --------------------------------------------------------------------------------------------------------
+
+
+def scene_to_json_text(scene: Scene) -> str:
+    """The text of ``scene.json``: one record a line, so that people can read and compare it."""
+    source = scene.source
+    head: dict[str, Any] = {
+        "format": FORMAT,
+        "schema_version": SCHEMA_VERSION,
+        "id": scene.id,
+        "conventions": "metres, seconds, pixels; world z up; camera x right, y down, z forward; a_from_b row-major 3x4; "
+        "the centre of the top-left pixel is (0.5, 0.5)",
+        "source": {
+            "dataset": source.dataset, "licence": source.licence, "recipe": source.recipe, "notes": list(source.notes),
+        },
+    }  # fmt: skip
+    cameras = [f"{json.dumps(name)}: {_dumps(camera_to_json(camera))}" for name, camera in scene.cameras.items()]
+    ego = {"times_s": scene.ego.times_s.tolist(), "world_from_ego": _poses_to_json(scene.ego.world_from_ego)}
+    lines = [f" {json.dumps(key)}: {_dumps(value)}," for key, value in head.items()]
+    lines.append(' "cameras": {\n  ' + ",\n  ".join(cameras) + "\n },")
+    lines.append(' "frames": [' + _record_lines(_frame_to_json(frame) for frame in scene.frames) + "],")
+    lines.append(' "sweeps": [' + _record_lines(_sweep_to_json(sweep) for sweep in scene.sweeps) + "],")
+    lines.append(' "split": ' + _dumps(dict(scene.split)) + ",")
+    lines.append(' "ego": ' + _dumps(ego))
+    return "{\n" + "\n".join(lines) + "\n}\n"
+
+
+def tracks_to_json_text(tracks: Iterable[Track]) -> str:
+    """The text of ``tracks.json``, one track a line."""
+    records = (
+        {
+            "id": track.id, "label": track.label, "size_m": track.size_m.tolist(), "times_s": track.times_s.tolist(),
+            "world_from_object": _poses_to_json(track.world_from_object),
+        }
+        for track in tracks
+    )  # fmt: skip
+    head = f'"format": "{TRACKS_FORMAT}",\n "schema_version": {SCHEMA_VERSION}'
+    return f'{{\n {head},\n "tracks": [{_record_lines(records)}]\n}}\n'
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """A camera without its name; ``parse_camera`` reads it."""
+    values = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {**values, "distortion": list(camera.distortion), "readout_s": camera.readout_s}
+
+
+def _poses_to_json(poses: NDArray[np.float64]) -> list[list[float]]:
+    """f64[n, 4, 4] as n times 12 numbers, row by row."""
+    return poses[:, :3].reshape(len(poses), 12).tolist()
+
+
+def _frame_to_json(frame: Frame) -> dict[str, Any]:
+    view = frame.view
+    return {
+        "id": frame.id, "camera": view.camera.name, "time_s": view.time_s,
+        "world_from_cam": _poses_to_json(view.world_from_cam[None])[0],
+        "image": frame.image.path, "labels": {name: ref.path for name, ref in frame.labels.items()},
+    }  # fmt: skip
+
+
+def _sweep_to_json(sweep: Sweep) -> dict[str, Any]:
+    pose = _poses_to_json(sweep.world_from_lidar[None])[0]
+    return {
+        "id": sweep.id, "sensor": sweep.sensor, "time_s": sweep.time_s, "world_from_lidar": pose,
+        "points": sweep.points.path,
+    }  # fmt: skip
+
+
+def _record_lines(records: Iterable[dict[str, Any]]) -> str:
+    lines = [_dumps(record) for record in records]
+    return "\n  " + ",\n  ".join(lines) + "\n " if lines else ""
+
+
+def _dumps(value: object) -> str:
+    try:
+        return json.dumps(value, allow_nan=False)
+    except ValueError as error:
+        what, remedy = "a value that is NaN or infinite cannot be written into a scene", "check poses and times"
+        raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error
+    except TypeError as error:
+        what, remedy = (
+            "a value that JSON cannot hold",
+            "give plain numbers, texts, lists and dicts in the source recipe",
+        )
+        raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error

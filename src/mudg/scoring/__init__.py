@@ -1,0 +1,1 @@
+"""Scores of views against truth, one by one and as sets."""

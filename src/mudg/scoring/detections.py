@@ -1,0 +1,286 @@
+"""NTA-IoU and NTL-IoU from what detectors made of the images, read from files: boxes as COCO results, lanes as masks.
+
+No detector is part of the program. Images are named ``METHOD/TRAJECTORY/000003``, as in the folders of views; ``truth/TRAJECTORY/...`` and
+``recorded/CAMERA/...`` name true and recorded images, which give the anchors that stand beside every value.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError
+from mudg.base.types import Scene, Track, View
+from mudg.city.world import CityWorld
+from mudg.core import street_scores as box_scores
+from mudg.core import street_scores as lane_scores
+from mudg.core.fusion import points_in_box
+from mudg.core.street_scores import (
+    NTA_CONFIDENCE,
+    NTA_FEWEST_POINTS,
+    NTA_HEIGHT_PX,
+    NTA_WIDTH_PX,
+    VEHICLE_LABELS,
+    ImageBox,
+)
+from mudg.editing.view_settings import ScoreConfig
+from mudg.scene.read import read_points
+from mudg.scoring import tables as score_tables
+from mudg.scoring.truth import SAME_SWEEP_S
+
+CAR_AND_BUS: Final = (2, 5)
+"""Numbers of two of the 80 classes of COCO, as YOLO counts them: those that ReconDreamer's score keeps; DriveDreamer4D's keeps all."""
+TRUTH: Final = "truth"
+RECORDED: Final = "recorded"
+_BOXES: Final = "a list of records with image_id, category_id, bbox [x, y, width, height] and score"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """A detector's box in pixels of 480 x 320, its class and confidence in [0, 1]."""
+
+    box: ImageBox
+    category: int
+    score: float
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """Images of one method on one trajectory.
+
+    Args:
+        key: first part of their names. numbers: of the images that count. views: of these.
+    """
+
+    key: str
+    numbers: tuple[int, ...]
+    views: tuple[View, ...]
+
+    def names(self) -> list[str]:
+        """Names of the images."""
+        return [f"{self.key}/{number:06d}" for number in self.numbers]
+
+
+def read_detections(path: Path) -> dict[str, list[Detection]]:
+    """Boxes by image name, without those of a confidence of at most 0.5.
+
+    Understood are COCO's result form, a list whose boxes are in pixels of images resized to 480 x 320, as the published score does it;
+    and a mapping with ``images`` (id, file_name, width, height) and ``annotations``, whose boxes are in pixels of these images.
+
+    Raises:
+        InputError: anything else.
+    """
+    content = store.read_json(path)
+    sizes: dict[Any, tuple[str, float, float]] = {}
+    if isinstance(content, Mapping):
+        try:
+            for image in content["images"]:
+                scale = NTA_WIDTH_PX / float(image["width"]), NTA_HEIGHT_PX / float(image["height"])
+                sizes[image["id"]] = (str(image["file_name"]), *scale)
+            content = content["annotations"]
+        except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+            raise InputError("malformed file of boxes", where=str(path), expected="images (id, file_name, width, height) and annotations",
+                got=repr(error)) from error  # fmt: skip
+    if not isinstance(content, list):
+        raise InputError("a file of boxes holds no list", where=str(path), expected=_BOXES, got=type(content).__name__)
+    found: dict[str, list[Detection]] = {}
+    for name, _, _ in sizes.values():
+        found.setdefault(image_name(name), [])
+    for number, record in enumerate(content):
+        name, detection = _parsed(record, sizes, f"{path}: record {number}")
+        kept = found.setdefault(name, [])
+        if detection.score > NTA_CONFIDENCE:
+            kept.append(detection)
+    return found
+
+
+def _parsed(record: Any, sizes: Mapping[Any, tuple[str, float, float]], where: str) -> tuple[str, Detection]:
+    try:
+        given, category, score = record["image_id"], int(record["category_id"]), float(record.get("score", 1.0))
+        x, y, width, height = (float(v) for v in record["bbox"])
+        name, across, down = sizes.get(given, (str(given), 1.0, 1.0))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
+    if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
+        raise InputError("a detected box is impossible", where=where, expected="finite numbers, sizes of at least 0, a score in 0..1",
+            got=repr(record)[:120])  # fmt: skip
+    if sizes and given not in sizes:
+        raise InputError(
+            "a detected box belongs to no image", where=where, got=str(given), expected="an id of the images"
+        )
+    return image_name(name), Detection(
+        np.array([x * across, y * down, (x + width) * across, (y + height) * down]), category, score
+    )
+
+
+def image_name(given: str) -> str:
+    """``METHOD/TRAJECTORY/000003`` of a file name that may have a folder ``rgb`` and an ending."""
+    return re.sub(r"\.(png|jpe?g)$", "", given.replace("\\", "/").replace("/rgb/", "/"), flags=re.IGNORECASE)
+
+
+class BoxDetections:
+    """NTA-IoU of methods.
+
+    Args:
+        scene: whose tracked boxes are the truth. path: file of boxes. as_published: true boxes also of corners behind the camera.
+    """
+
+    def __init__(self, scene: Scene, path: Path, as_published: bool) -> None:
+        self._scene, self._as_published = scene, as_published
+        self._found = read_detections(path)
+        self.sha256 = store.sha256_file(path)
+        self._counts: dict[str, dict[str, int]] = {}
+
+    def of(self, images: ViewImages) -> dict[str, Any] | str:
+        """``value`` with all classes, ``car_and_bus`` with these alone, number of ``truths``; or why there is none."""
+        if not any(name in self._found for name in images.names()):
+            return score_tables.NO_DETECTIONS
+        values: dict[str, list[float]] = {"value": [], "car_and_bus": []}
+        for name, view in zip(images.names(), images.views, strict=True):
+            truths = [box for _, box in box_scores.nta_truths(view, self._tracks_at(view), self._as_published)]
+            own = self._found.get(name, [])
+            values["value"] += box_scores.nta_iou(truths, [d.box for d in own])
+            values["car_and_bus"] += box_scores.nta_iou(truths, [d.box for d in own if d.category in CAR_AND_BUS])
+        if not values["value"]:
+            return score_tables.NO_TRUTH
+        return {"truths": len(values["value"]), **{k: round(sum(v) / len(v), 6) for k, v in values.items()}}
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, for metrics.json."""
+        return {
+            "file_sha256": self.sha256, "confidence_above": NTA_CONFIDENCE, "reach_px": box_scores.NTA_REACH_PX,
+            "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX], "classes": "all; beside it COCO's car and bus alone (2 and 5)",
+            "boxes": "as published: corners behind the camera are not cut off" if self._as_published else "cut at the near plane",
+            "fewest_points": NTA_FEWEST_POINTS if self._scene.sweeps else None,
+            "points": "counted in the sweeps taken with the view" if self._scene.sweeps else "no sweeps: boxes of any number count",
+        }  # fmt: skip
+
+    def _tracks_at(self, view: View) -> Sequence[Track]:
+        """Tracks with at least ten LiDAR points at a view's time; all of them where no sweep was taken then."""
+        sweeps = [s for s in self._scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
+        if not sweeps:
+            return self._scene.tracks
+        vehicles = [track for track in self._scene.tracks if track.label in VEHICLE_LABELS]
+        totals = dict.fromkeys((track.id for track in vehicles), 0)
+        for sweep in sweeps:
+            if sweep.id not in self._counts:
+                xyz = read_points(self._scene, sweep).xyz.astype(np.float64)
+                self._counts[sweep.id] = {}
+                for track in vehicles:
+                    pose = track.pose_at(sweep.time_s)
+                    if pose is not None:
+                        local = geometry.transform_points(geometry.invert(pose) @ sweep.world_from_lidar, xyz)
+                        self._counts[sweep.id][track.id] = int(points_in_box(local, track.size_m, 0.0, 0.0).sum())
+            for name, count in self._counts[sweep.id].items():
+                totals[name] += count
+        return [track for track in vehicles if totals[track.id] >= NTA_FEWEST_POINTS]
+
+
+class LaneDetections:
+    """NTL-IoU of methods.
+
+    Args:
+        scene: a generated city, whose markings and kerbs take the place of a map. folder: masks ``METHOD/TRAJECTORY/000003.png``.
+
+    Raises:
+        InputError: the scene has no lane lines, or the folder is missing.
+    """
+
+    def __init__(self, scene: Scene, folder: Path) -> None:
+        if scene.source.recipe is None:
+            raise InputError("the log has no lane lines to hold detected lanes against", where=scene.root, got=scene.source.dataset,
+                expected="a generated city: prepared logs keep no map", remedy="leave out --lanes")  # fmt: skip
+        if not folder.is_dir():
+            raise InputError("no such folder of lane masks", where=str(folder))
+        self._lines = CityWorld.from_source(scene.source).lane_lines()
+        self._folder = folder
+
+    def of(self, images: ViewImages) -> dict[str, Any] | str:
+        """``value``, IoU of ``lanes`` alone, and number of ``frames``; or why there is none.
+
+        Raises:
+            InputError: some masks of a set are missing, or one cannot be read.
+        """
+        files = [self._folder / f"{name}.png" for name in images.names()]
+        if not any(path.is_file() for path in files):
+            return score_tables.NO_DETECTIONS
+        values, lanes = [], []
+        for path, view in zip(files, images.views, strict=True):
+            found, true = lane_scores.at_lane_size(read_mask(path)), lane_scores.lane_truth(view, self._lines)
+            values.append(lane_scores.ntl_iou(found, true))
+            union = int((found | true).sum())
+            lanes.append(float((found & true).sum() / union) if union else 0.0)
+        return {
+            "frames": len(values),
+            "value": round(sum(values) / len(values), 6),
+            "lanes": round(sum(lanes) / len(lanes), 6),
+        }
+
+    def against(self, images: ViewImages, true: ViewImages) -> float | None:
+        """The second convention: masks of the images against the detector's own masks of the true images; None where those are missing."""
+        pairs = [
+            (self._folder / f"{a}.png", self._folder / f"{b}.png")
+            for a, b in zip(images.names(), true.names(), strict=True)
+        ]
+        if not pairs or not all(path.is_file() for pair in pairs for path in pair):
+            return None
+        masks = [[lane_scores.at_lane_size(read_mask(path)) for path in pair] for pair in pairs]
+        return round(sum(lane_scores.ntl_iou(a, b) for a, b in masks) / len(masks), 6)
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, for metrics.json."""
+        return {"lines": "markings, kerbs and crosswalks of the generated city; nothing hides them", "size": [640, 360]}
+
+
+def read_mask(path: Path) -> NDArray[np.uint8]:
+    """A mask u8[H, W]; InputError if it is missing or no picture."""
+    if not path.is_file():
+        raise InputError("a lane mask is missing", where=str(path), expected="one mask for each scored view")
+    try:
+        with Image.open(io.BytesIO(store.read_bytes(path))) as picture:
+            return np.asarray(picture.convert("L"))
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise InputError("a lane mask cannot be decoded", where=str(path), got=str(error)) from error
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What was given of boxes and lanes."""
+
+    boxes: BoxDetections | None
+    lanes: LaneDetections | None
+
+    @property
+    def rows(self) -> Mapping[str, tuple[str, Callable[[ViewImages], dict[str, Any] | str]]]:
+        """Metric -> entry of a result, and what computes it."""
+        found: dict[str, tuple[str, Callable[[ViewImages], dict[str, Any] | str]]] = {}
+        if self.boxes is not None:
+            found["nta_iou"] = ("nta", self.boxes.of)
+        if self.lanes is not None:
+            found["ntl_iou"] = ("ntl", self.lanes.of)
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, for metrics.json."""
+        given = {"nta_iou": self.boxes, "ntl_iou": self.lanes}
+        return {name: source.record() for name, source in given.items() if source is not None}
+
+
+def detections_of(config: ScoreConfig, scene: Scene) -> Detections:
+    """What reads the files that a configuration names.
+
+    Raises:
+        InputError: a file is missing or malformed, or the log has no lane lines.
+    """
+    boxes = BoxDetections(scene, Path(config.detections), config.as_published) if config.detections else None
+    return Detections(boxes, LaneDetections(scene, Path(config.lanes)) if config.lanes else None)

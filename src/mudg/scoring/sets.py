@@ -1,0 +1,686 @@
+"""FID and KID of a method on a trajectory: its images as a set, against the recorded frames of the same camera.
+
+The reference is the recorded video, as in published tables, so there is a number off the recorded path of a driving log, too, where no
+other metric has a truth. Sets are small, and FID of small sets is mostly bias: every trajectory also gets a floor, what the truth itself
+would score.
+
+Features are kept in the folder of the scores, in a file whose name is the hash of weights, rule and pixels: an interrupted run does not
+compute a set again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import seeds, store
+from mudg.base.devices import choose_device
+from mudg.base.errors import InputError
+from mudg.base.types import Scene, View
+from mudg.base.weights import read_checkpoint
+from mudg.core import feature_distances
+from mudg.core.feature_distances import cmmd_distance, frechet_distance, polynomial_distance
+from mudg.core.pictures import resize_rgb, to_bytes
+from mudg.editing.view_settings import ScoreConfig
+from mudg.networks import clip_image, dinov2, i3d, inception
+from mudg.scene.read import read_image
+from mudg.scoring import tables as score_tables
+from mudg.scoring.converted import source_sha256
+from mudg.scoring.truth import SAME_TIME_S
+
+FEATURES_FOLDER: Final = "features"
+FEWEST: Final = 2
+BLOCK_FRAMES: Final = 8
+"""Neighbouring frames that the error of KID takes as one draw."""
+FEWEST_BLOCKS: Final = 4
+FEWEST_TO_EXTRAPOLATE: Final = 1000
+_BATCH: Final = 8
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Images u8[H, W, 3] that are read one at a time: ``image(number)`` for 0 to ``count`` - 1."""
+
+    count: int
+    image: Callable[[int], NDArray[np.uint8]]
+
+    def resized(self, width: int, height: int) -> ImageSet:
+        """The same images at one size, bilinear with antialiasing."""
+
+        def image(number: int) -> NDArray[np.uint8]:
+            found = self.image(number)
+            if found.shape[:2] == (height, width):
+                return found
+            planes = torch.from_numpy(np.array(found)).permute(2, 0, 1).float() / 255
+            return to_bytes(resize_rgb(planes, height, width))
+
+        return ImageSet(self.count, image)
+
+
+@dataclass(frozen=True)
+class TrajectorySets:
+    """What is compared on one trajectory.
+
+    Args:
+        name, camera: of the trajectory. width, height: common size, pixels.
+        methods: the counted images of every method.
+        truth: the true images of the same views where they are known and are not the recorded ones, else None.
+    """
+
+    name: str
+    camera: str
+    width: int
+    height: int
+    methods: Mapping[str, ImageSet]
+    truth: ImageSet | None
+
+
+@dataclass(frozen=True)
+class SetDistances:
+    """FID and KID of ``n`` images against ``n_reference``, and what stands beside them in metrics.json."""
+
+    n: int
+    n_reference: int
+    fid: float
+    kid: float
+    kid_standard_error: float | None
+    mind: float
+    fid_at_infinity: float | None
+
+    def record(self) -> dict[str, Any]:
+        """As JSON values, rounded to 6 digits after the point."""
+        values = {
+            "kid_standard_error": self.kid_standard_error,
+            "mind": self.mind,
+            "fid_at_infinity": self.fid_at_infinity,
+        }
+        return {
+            "n": self.n,
+            "n_reference": self.n_reference,
+            **{k: None if v is None else round(v, 6) for k, v in values.items()},
+        }
+
+
+@dataclass(frozen=True)
+class EmbeddingFiles:
+    """Embeddings of sets of images by a network, kept in a folder.
+
+    Args:
+        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it. width: of the embedding.
+        key: weights and rules, by which kept files are found. folder: where they lie. device: of the network.
+    """
+
+    network: Callable[[Tensor], Tensor]
+    prepare: Callable[[NDArray[np.uint8]], Tensor]
+    width: int
+    key: str
+    folder: Path
+    device: torch.device
+
+    def of(self, images: ImageSet) -> NDArray[np.float32]:
+        """Embeddings f32[n, width], read from the folder if these very pixels were seen before."""
+        return self.named(images)[1]
+
+    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the embeddings ("" of an empty set), and the embeddings f32[n, width]."""
+        if not images.count:
+            return "", np.zeros((0, self.width), np.float32)
+        return kept_features(self.folder, self.key, images, (images.count, self.width), lambda: self._computed(images))
+
+    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
+        batches = []
+        for start in range(0, images.count, _BATCH):
+            batch = [self.prepare(images.image(n)) for n in range(start, min(start + _BATCH, images.count))]
+            with torch.no_grad():
+                batches.append(self.network(torch.stack(batch).to(self.device)).cpu().numpy())
+        return np.concatenate(batches)
+
+
+class FeatureFiles:
+    """Features of sets of images by FID's network, kept in a folder.
+
+    Args:
+        weights: file with the network's weights. rule: how images get its size. folder: where features are kept. device: of the network.
+
+    Raises:
+        InputError: the file is missing, damaged, or holds another network.
+    """
+
+    def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
+        self.rule: inception.ResizeRule = rule
+        state = read_checkpoint(weights)
+        self.sha256, self.source_sha256 = store.sha256_file(weights), source_sha256(weights)
+        network = inception.InceptionFeatures(state, str(weights)).to(device)
+        self._files = EmbeddingFiles(
+            lambda batch: network(batch)["2048"], lambda rgb: inception.prepared(rgb, rule), inception.WIDTH,
+            f"Inception {self.sha256} {rule}", folder, device,
+        )  # fmt: skip
+
+    def of(self, images: ImageSet) -> NDArray[np.float32]:
+        """Features f32[n, 2048] of a set."""
+        return self._files.of(images)
+
+    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the features of a set, and the features."""
+        return self._files.named(images)
+
+
+def kept_features(
+    folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
+) -> tuple[str, NDArray[np.float32]]:
+    """The name of the file with the features of a set, and the features: from a folder if these very pixels went through the same network
+    before, else computed and kept there.
+
+    Args:
+        folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute: makes them.
+    """
+    content = hashlib.sha256(f"{key} {images.count}".encode())
+    for number in range(images.count):
+        picture = images.image(number)
+        content.update(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes())
+    path = folder / f"{content.hexdigest()}.safetensors"
+    if path.is_file():
+        found = store.read_safetensors(path).get("features")
+        if found is not None and found.shape == shape:
+            return path.name, found
+    features = compute()
+    store.write_safetensors(path, {"features": features})
+    return path.name, features
+
+
+def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
+    """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the camera."""
+    frames = scene.frames_of(sets.camera) if sets.camera in scene.cameras else ()
+    return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
+
+
+@dataclass(frozen=True)
+class FeatureSets:
+    """Which files of features were compared, so that sets of several logs can be pooled: one record per method and trajectory."""
+
+    records: list[dict[str, str]] = field(default_factory=list)
+
+    def note(self, trajectory: str, method: str, made: str, reference: str) -> None:
+        """Note the names of two files in the folder of features."""
+        self.records.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
+
+
+class Distributions:
+    """FID and KID of every trajectory of a scene.
+
+    Args:
+        scene: whose recorded frames are the reference. features: how images become features.
+    """
+
+    def __init__(self, scene: Scene, features: FeatureFiles) -> None:
+        self._scene, self._features = scene, features
+        self._recorded: dict[tuple[str, int, int], tuple[str, NDArray[np.float32]]] = {}
+        self._floors: list[dict[str, Any]] = []
+        self._sets = FeatureSets()
+
+    def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
+        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
+
+        Raises:
+            InputError: methods have different numbers of images.
+        """
+        counts = {method: images.count for method, images in sets.methods.items()}
+        if len(set(counts.values())) > 1:
+            raise InputError("FID of sets of different size cannot be compared", where=sets.name, expected="the same views for all methods",
+                got=", ".join(f"{method}: {count}" for method, count in counts.items()))  # fmt: skip
+        name, reference = self._reference(sets)
+        if not len(reference):
+            return dict.fromkeys(counts, score_tables.NO_TRUTH)
+        if min(*counts.values(), len(reference)) < FEWEST:
+            return dict.fromkeys(counts, score_tables.TOO_FEW)
+        found: dict[str, SetDistances | str] = {}
+        for method, images in sets.methods.items():
+            own, made = self._features.named(images.resized(sets.width, sets.height))
+            self._sets.note(sets.name, method, own, name)
+            found[method] = distances(made, reference)
+        self._note_floor(sets, reference)
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, and the floors, for metrics.json."""
+        return {
+            "network": "Inception-v3 of 2015, global average, 2048 values", "weights_sha256": self._features.sha256,
+            "published_weights": self._features.source_sha256 == inception.KNOWN_SHA256, "resize": self._features.rule,
+            "reference": "recorded frames of the same camera", "covariance": "n - 1", "floors": self._floors, "sets": self._sets.records,
+        }  # fmt: skip
+
+    def _reference(self, sets: TrajectorySets) -> tuple[str, NDArray[np.float32]]:
+        key = (sets.camera, sets.width, sets.height)
+        if key not in self._recorded:
+            self._recorded[key] = self._features.named(recorded_images(self._scene, sets))
+        return self._recorded[key]
+
+    def _note_floor(self, sets: TrajectorySets, reference: NDArray[np.float32]) -> None:
+        if sets.truth is not None:
+            how = "true images of the same views"
+            found = distances(self._features.of(sets.truth.resized(sets.width, sets.height)), reference)
+        elif len(reference) >= 2 * FEWEST:
+            how, found = "every second recorded frame against the others", distances(reference[::2], reference[1::2])
+        else:
+            return
+        values = {"fid": round(found.fid, 6), "kid": round(found.kid, 6), **found.record()}
+        self._floors.append({"trajectory": sets.name, "how": how, **values})
+
+
+def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions | None:
+    """What computes FID and KID, or None where no weights are given.
+
+    Raises:
+        InputError: the file of weights is missing, damaged, or holds another network.
+    """
+    if not config.fid_weights:
+        return None
+    device = choose_device(config.device, "networks of the scores")
+    return Distributions(
+        scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, out / FEATURES_FOLDER, device)
+    )
+
+
+def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
+    """All distances of two sets of features ``[n, d]``, at least two rows each; rows in order of time."""
+    blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (made, reference))
+    error = None
+    if all(len(set(numbers.tolist())) >= FEWEST_BLOCKS for numbers in blocks):
+        error = feature_distances.kernel_distance_error(made, reference, blocks, seeds.numpy_rng(0, 0, "blocks of KID"))
+    many = min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE
+    return SetDistances(
+        n=len(made), n_reference=len(reference), fid=feature_distances.frechet_distance(made, reference),
+        kid=feature_distances.kernel_distance(made, reference), kid_standard_error=error,
+        mind=feature_distances.mind_distance(made, reference, seeds.numpy_rng(0, 0, "directions of MIND")),
+        fid_at_infinity=feature_distances.frechet_at_infinity(made, reference, seeds.numpy_rng(0, 0, "sizes of FID")) if many else None,
+    )  # fmt: skip
+
+
+# videos ---------------------------------------------------------------------------------------------------------------
+#
+# FVD of a method on a trajectory: its clips as a set, against the clips of the recorded video of the same camera.
+#
+# All views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that a drive of 40
+# frames gives four.
+
+
+CLIP_FRAMES: Final = 16
+HOP_FRAMES: Final = 8
+
+
+class ClipFiles:
+    """Features of the clips of a video by FVD's network, kept in a folder.
+
+    Args:
+        weights: file with the network's weights. rule: how frames get its size. folder: where features are kept. device: of the network.
+
+    Raises:
+        InputError: the file is missing, damaged, or holds another network.
+    """
+
+    def __init__(self, weights: Path, rule: i3d.VideoRule, folder: Path, device: torch.device) -> None:
+        self.rule: i3d.VideoRule = rule
+        state = read_checkpoint(weights)
+        self.sha256 = store.sha256_file(weights)
+        self._folder, self._device = folder, device
+        self._network = i3d.I3DFeatures(state, str(weights)).to(device)
+
+    def of(self, images: ImageSet) -> NDArray[np.float32]:
+        """Features f32[clips, 400]; no row if the video is shorter than a clip."""
+        return self.named(images)[1]
+
+    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
+        """The name of the file that holds the features ("" if there is no clip), and the features."""
+        count = clip_count(images.count)
+        if not count:
+            return "", np.zeros((0, i3d.WIDTH), np.float32)
+        key = f"I3D {self.sha256} {self.rule} {CLIP_FRAMES} {HOP_FRAMES}"
+        return kept_features(self._folder, key, images, (count, i3d.WIDTH), lambda: self._computed(images))
+
+    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
+        rows = []
+        for clip in self._clips(images):
+            with torch.no_grad():
+                rows.append(self._network(clip[None].to(self._device)).cpu().numpy())
+        return np.concatenate(rows)
+
+    def _clips(self, images: ImageSet) -> Iterator[Tensor]:
+        """Clips f32[3, 16, 224, 224] in order of time."""
+        window: list[Tensor] = []
+        for number in range(images.count):
+            window = [*window[-CLIP_FRAMES + 1 :], i3d.prepared_frame(images.image(number), self.rule)]
+            begin = number + 1 - CLIP_FRAMES
+            if begin >= 0 and begin % HOP_FRAMES == 0:
+                yield torch.stack(window, 1)
+
+
+def clip_count(frames: int) -> int:
+    """How many clips a video has."""
+    return 0 if frames < CLIP_FRAMES else (frames - CLIP_FRAMES) // HOP_FRAMES + 1
+
+
+class VideoDistances:
+    """FVD of every trajectory of a scene.
+
+    Args:
+        scene: whose recorded video is the reference. clips: how videos become features.
+    """
+
+    def __init__(self, scene: Scene, clips: ClipFiles) -> None:
+        self._scene, self._clips = scene, clips
+        self._floors: list[dict[str, Any]] = []
+        self._sets = FeatureSets()
+
+    def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
+        """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for ``record``.
+
+        Args:
+            sets: with all views of every method, in order of time.
+        """
+        recorded = recorded_images(self._scene, sets)
+        if not recorded.count:
+            return dict.fromkeys(sets.methods, score_tables.NO_TRUTH)
+        if min(clip_count(v.count) for v in (*sets.methods.values(), recorded)) < FEWEST:
+            return dict.fromkeys(sets.methods, score_tables.TOO_FEW)
+        name, reference = self._clips.named(recorded)
+        found: dict[str, dict[str, Any] | str] = {}
+        for method, images in sets.methods.items():
+            own, made = self._clips.named(images.resized(sets.width, sets.height))
+            self._sets.note(sets.name, method, own, name)
+            found[method] = compared(made, reference)
+        half = len(reference) // 2
+        if sets.truth is not None:
+            floor = compared(self._clips.of(sets.truth.resized(sets.width, sets.height)), reference)
+            self._floors.append({"trajectory": sets.name, "how": "true images of the same views", **floor})
+        elif half >= FEWEST:
+            floor = compared(reference[:half], reference[half:])
+            self._floors.append(
+                {"trajectory": sets.name, "how": "first half of the recorded video against the second", **floor}
+            )
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, and the floors, for metrics.json."""
+        return {
+            "network": "I3D, Kinetics-400, scores before the softmax, 400 values", "weights_sha256": self._clips.sha256,
+            "norm_epsilon": i3d.NORM_EPSILON, "resize": self._clips.rule, "clip_frames": CLIP_FRAMES, "hop_frames": HOP_FRAMES,
+            "reference": "recorded video of the same camera", "covariance": "n - 1", "floors": self._floors,
+            "sets": self._sets.records,
+        }  # fmt: skip
+
+
+def compared(made: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[str, Any]:
+    """FVD of two sets of features ``[n, d]`` with their sizes."""
+    return {"fvd": round(frechet_distance(made, reference), 6), "n": len(made), "n_reference": len(reference)}
+
+
+def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances | None:
+    """What computes FVD, or None where no weights are given.
+
+    Raises:
+        InputError: the file of weights is missing, damaged, or holds another network.
+    """
+    if not config.fvd_weights:
+        return None
+    device = choose_device(config.device, "networks of the scores")
+    return VideoDistances(scene, ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device))
+
+
+# video features -------------------------------------------------------------------------------------------------------
+#
+# Distances of videos in features that an extractor elsewhere made of their clips, such as V-JEPA (JEDi) or VideoMAE.
+#
+# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file, and this package executes no
+# data.
+# What they give is a table of numbers, and that is what is read: ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``,
+# each with one tensor ``features`` [clips, values].
+
+
+RECORDED: Final = "recorded"
+TRUTH: Final = "truth"
+
+
+class VideoFeatures:
+    """Frechet and polynomial distances of every trajectory.
+
+    Args:
+        folder: of the tables.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise InputError("no such folder of features", where=str(folder),
+                expected="METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor features [clips, values]",
+                remedy="run the extractor yourself and save what it gives; programs (TorchScript) are not read")  # fmt: skip
+        self._folder = folder
+        self._floors: list[dict[str, Any]] = []
+        self._width: int | None = None
+
+    def of(self, trajectory: str, camera: str, methods: Sequence[str]) -> dict[str, dict[str, Any] | str]:
+        """By method ``values`` and numbers of clips, or why there are none; the floor of the trajectory is noted for ``record``."""
+        reference = self._read(f"{RECORDED}/{camera}")
+        if reference is None:
+            return dict.fromkeys(methods, score_tables.NO_FEATURES)
+        found: dict[str, dict[str, Any] | str] = {}
+        for method in methods:
+            made = self._read(f"{method}/{trajectory}")
+            found[method] = score_tables.NO_FEATURES if made is None else _compared(made, reference)
+        true = self._read(f"{TRUTH}/{trajectory}")
+        if true is not None and not isinstance(floor := _compared(true, reference), str):
+            sizes = {"n": floor["n"], "n_reference": floor["n_reference"]}
+            self._floors.append({"trajectory": trajectory, "how": "true clips", **floor["values"], **sizes})
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, and the floors."""
+        return {
+            "features": "made elsewhere", "width": self._width, "folder_sha256": store.digest(self._folder), "covariance": "n - 1",
+            "kernel": "(x.y / d)^2, biased, times 100", "reference": "clips of the recorded video of the same camera",
+            "floors": self._floors,
+        }  # fmt: skip
+
+    def _read(self, name: str) -> NDArray[np.float64] | None:
+        path = self._folder / f"{name}.safetensors"
+        if not path.is_file():
+            return None
+        found = store.read_safetensors(path).get("features")
+        if found is None or found.ndim != 2 or not np.issubdtype(found.dtype, np.floating):
+            raise InputError("a table of video features is malformed", where=str(path), expected="one tensor features [clips, values]",
+                got="no such tensor" if found is None else f"{found.dtype} {found.shape}")  # fmt: skip
+        self._width = int(found.shape[1])
+        return found.astype(np.float64)
+
+
+def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, Any] | str:
+    if min(len(made), len(reference)) < FEWEST:
+        return score_tables.TOO_FEW
+    values = {"video_frechet": frechet_distance(made, reference), "video_mmd": polynomial_distance(made, reference)}
+    return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(made), "n_reference": len(reference)}
+
+
+# embeddings -----------------------------------------------------------------------------------------------------------
+#
+# Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
+#
+# Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does. CLIP-F and
+# consistency
+# follow the video, so all views count.
+
+
+Rows = NDArray[np.float32]
+
+
+class SetDistance:
+    """A distance of counted views from the recorded frames, with its floors.
+
+    Args:
+        scene: whose recorded frames are the reference. files: makes embeddings. name: of the metric. distance: of two sets.
+    """
+
+    def __init__(self, scene: Scene, files: EmbeddingFiles, name: str, distance: Callable[[Rows, Rows], float]) -> None:
+        self.scene, self.files, self._name, self._distance = scene, files, name, distance
+        self.floors: list[dict[str, Any]] = []
+
+    def recorded(self, sets: TrajectorySets) -> Rows:
+        """Embeddings of the recorded frames of a trajectory's camera."""
+        return self.files.of(recorded_images(self.scene, sets))
+
+    def note_floor(self, sets: TrajectorySets, reference: Rows, counted: Sequence[int]) -> None:
+        """Note what the truth itself scores."""
+        if sets.truth is not None:
+            how, made, against = (
+                "true images of the same views",
+                self.files.of(_sized(sets.truth, sets))[list(counted)],
+                reference,
+            )
+        elif len(reference) >= 2 * FEWEST:
+            how, made, against = "every second recorded frame against the others", reference[::2], reference[1::2]
+        else:
+            return
+        floor = {self._name: round(self._distance(made, against), 6), "n": len(made), "n_reference": len(against)}
+        self.floors.append({"trajectory": sets.name, "how": how, **floor})
+
+    def value(self, made: Rows, reference: Rows) -> dict[str, Any]:
+        """The distance and the sizes of both sets; or why there is none."""
+        if not len(reference):
+            return {"values": {self._name: score_tables.NO_TRUTH}}
+        if min(len(made), len(reference)) < FEWEST:
+            return {"values": {self._name: score_tables.TOO_FEW}}
+        found = {self._name: round(self._distance(made, reference), 6)}
+        return {"values": found, "n": len(made), "n_reference": len(reference)}
+
+
+def _sized(images: ImageSet, sets: TrajectorySets) -> ImageSet:
+    return images.resized(sets.width, sets.height)
+
+
+class DinoScores:
+    """FD-DINOv2 and the consistency of the video, of every trajectory of a scene."""
+
+    def __init__(self, scene: Scene, files: EmbeddingFiles, made: dict[str, Any]) -> None:
+        self._sets, self._made = SetDistance(scene, files, "fd_dinov2", frechet_distance), made
+
+    def of(
+        self, sets: TrajectorySets, counted: Sequence[int], _views: Sequence[View]
+    ) -> dict[str, dict[str, Any] | str]:
+        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance."""
+        reference, found = self._sets.recorded(sets), {}
+        for method, images in sets.methods.items():
+            rows = self._sets.files.of(_sized(images, sets))
+            of = self._sets.value(rows[list(counted)], reference)
+            steady = subject_consistency(rows)
+            of["values"]["subject_consistency"] = score_tables.TOO_FEW if steady is None else round(steady, 6)
+            found[method] = of
+        self._sets.note_floor(sets, reference, counted)
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, and the floors."""
+        return {**self._made, "floors": self._sets.floors}
+
+
+class ClipScores:
+    """CMMD, CLIP-F and CLIP-V of every trajectory of a scene."""
+
+    def __init__(self, scene: Scene, files: EmbeddingFiles, made: dict[str, Any]) -> None:
+        self._scene, self._made = scene, made
+        self._sets = SetDistance(scene, files, "cmmd", cmmd_distance)
+
+    def of(
+        self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
+    ) -> dict[str, dict[str, Any] | str]:
+        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance and CLIP-V."""
+        reference, found = self._sets.recorded(sets), {}
+        frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
+        times = np.array([frame.view.time_s for frame in frames])
+        pairs = []
+        for place in counted if len(times) else ():
+            nearest = int(np.argmin(np.abs(times - views[place].time_s)))
+            if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
+                pairs.append((place, nearest))
+        for method, images in sets.methods.items():
+            rows = self._sets.files.of(_sized(images, sets))
+            of = self._sets.value(rows[list(counted)], reference)
+            units = _units(rows)
+            steps = (units[1:] * units[:-1]).sum(1)
+            of["values"]["clip_f"] = round(float(steps.mean()), 6) if len(steps) else score_tables.TOO_FEW
+            sources = _units(reference)
+            same = [float(units[a] @ sources[b]) for a, b in pairs]
+            of["values"]["clip_v"] = round(sum(same) / len(same), 6) if same else score_tables.NO_TRUTH
+            found[method] = of
+        self._sets.note_floor(sets, reference, counted)
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """How the numbers were made, and the floors."""
+        return {**self._made, "floors": self._sets.floors}
+
+
+def _units(rows: Rows) -> NDArray[np.float64]:
+    values = rows.astype(np.float64)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
+
+
+def subject_consistency(rows: NDArray[np.floating]) -> float | None:
+    """Mean over frames from the second on of (max(0, cosine with the one before) + max(0, cosine with the first)) / 2, as VBench's subject
+    consistency does it; None with fewer than two frames ``[n, d]``."""
+    if len(rows) < 2:
+        return None
+    units = _units(np.asarray(rows, np.float32))
+    before, first = (units[1:] * units[:-1]).sum(1), units[1:] @ units[0]
+    return float(((np.maximum(before, 0) + np.maximum(first, 0)) / 2).mean())
+
+
+def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> DinoScores | None:
+    """What computes FD-DINOv2, or None where no weights are given.
+
+    Raises:
+        InputError: the file of weights is missing, damaged, or holds another network.
+    """
+    if not config.dino_weights:
+        return None
+    path, device = Path(config.dino_weights), choose_device(config.device, "networks of the scores")
+    network = dinov2.DinoFeatures(read_checkpoint(path), str(path)).to(device)
+    sha256 = store.sha256_file(path)
+    files = EmbeddingFiles(network, dinov2.prepared, network.width, f"DINOv2 {sha256}", out / FEATURES_FOLDER, device)
+    made = {
+        "network": f"DINOv2 {network.name}, class token, {network.width} values", "weights_sha256": sha256,
+        "resize": "dgm-eval: Pillow's bicubic on 8 bits to 224x224", "positions": "bicubic by the factor (16 + 0.1) / 37",
+        "reference": "recorded frames of the same camera", "covariance": "n - 1",
+    }  # fmt: skip
+    return DinoScores(scene, files, made)
+
+
+def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
+    """What computes CMMD, or None where no weights are given.
+
+    Raises:
+        InputError: the file of weights is missing, damaged, or holds another network.
+    """
+    if not config.clip_weights:
+        return None
+    path, device = Path(config.clip_weights), choose_device(config.device, "networks of the scores")
+    network = clip_image.ClipImageFeatures(read_checkpoint(path), str(path)).to(device)
+    sha256 = store.sha256_file(path)
+
+    def prepare(rgb: NDArray[np.uint8]) -> Tensor:
+        return clip_image.prepared(rgb, network.side)
+
+    files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", out / FEATURES_FOLDER, device)
+    made = {
+        "network": f"CLIP {network.name}, projected, {network.out} values", "weights_sha256": sha256,
+        "resize": "bicubic without antialiasing, squashed", "kernel": "Gaussian, sigma 10, biased, times 1000",
+        "reference": "recorded frames of the same camera",
+    }  # fmt: skip
+    return ClipScores(scene, files, made)

@@ -1,0 +1,282 @@
+"""What views are held against: the generated city drawn again, held-out recorded frames, or truth drawn by an earlier run.
+
+A folder of truth (``write_truth``) holds one observation folder per trajectory and, beside the observations,
+``moving.safetensors``: ``moving`` u8[T, H, W], 1 where a dynamic object is seen, ``instance`` i32[T, H, W], and ``marking`` u8[T, H, W], 1
+where there is paint on the road.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg.base import geometry, log, palette, store
+from mudg.base.errors import InputError
+from mudg.base.types import Frame, Observation, Scene, Sweep, Track, Trajectory, View
+from mudg.city import logs as city_logs
+from mudg.city.world import CityWorld
+from mudg.core import lidar as points_seen
+from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
+from mudg.core.lidar import OwnedPoints, PointTruth, ShownFrame
+from mudg.core.pictures import resize_nearest, resize_rgb
+from mudg.core.project import RULES as HIDING_RULES
+from mudg.core.project import visible_depth
+from mudg.labels.annotate import nearest_sweeps
+from mudg.scene.labels import read_label
+from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.scene.read import read_image, read_points, read_scene
+
+MOVING_FILE: Final = "moving.safetensors"
+SAME_SWEEP_S: Final = 0.05
+MAX_LIDAR_M: Final = 100.0
+SAME_TIME_S: Final = 1e-4
+SAME_PLACE_M: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class ViewTruth:
+    """The truth at a view, with what is known only of generated cities: ``moving`` bool[1, H, W], true pixels of dynamic objects;
+    ``instance`` i32[H, W], number of the object that is seen; ``marking`` bool[H, W], paint on the road."""
+
+    seen: Observation
+    moving: Tensor | None = None
+    instance: NDArray[np.int32] | None = None
+    marking: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Where truth comes from: ``at_view(view, frame, trajectory)`` is None where there is none.
+
+    Args:
+        exact: truth exists at every pixel of every view. stored: it lies on disk already and need not be written again.
+    """
+
+    exact: bool
+    at_view: Callable[[View, Frame | None, str], ViewTruth | None]
+    stored: bool = False
+
+
+def apart_m(a: View, b: View) -> float:
+    """Distance of two cameras, metres."""
+    return float(np.linalg.norm(a.center_world - b.center_world))
+
+
+def truth_of(scene: Scene) -> Truth:
+    """Exact truth for a generated city; else the recorded frame a view belongs to."""
+    if scene.source.recipe is not None:
+        world = CityWorld.from_source(scene.source)
+        for frame in scene.frames:
+            there, stated = world.ego_path().pose_at(frame.view.time_s), scene.ego.pose_at(frame.view.time_s)
+            if there is None or stated is None or not np.allclose(there, stated, atol=1e-3):
+                raise InputError("the scene is not the generated city that its recipe names, so its truth would be another street's",
+                    where=f"{scene.root}: source.recipe, frame {frame.id}", expected="the path of the vehicle that the recipe makes",
+                    remedy="generate the city again; in scenes of other origin, leave the recipe out")  # fmt: skip
+        moving = np.array(city_logs.moving_instances(world), np.int32)
+        return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
+    return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))
+
+
+def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewTruth:
+    truth = world.render(view)
+    dynamic = torch.from_numpy(np.isin(truth.instance, moving))[None]
+    return ViewTruth(world.observation(view, truth), dynamic, truth.instance, world.markings(view, truth))
+
+
+def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> None:
+    """Draw the truth of a generated city on some trajectories once, for many scores.
+
+    Raises:
+        InputError: the scene was not generated.
+    """
+    truth = truth_of(read_scene(scene))
+    if not truth.exact:
+        raise InputError("only a generated city has ground truth at every view", where=str(scene))
+    with log.task("truth", sum(map(len, trajectories))) as bar:
+        for path in trajectories:
+            maps: dict[str, list[NDArray[Any]]] = {"moving": [], "instance": [], "marking": []}
+            with ObservationWriter(out / path.name, path.name, "truth", "recorded") as writer:
+                for view in path.views:
+                    true = truth.at_view(view, None, path.name)
+                    if true is None or true.moving is None or true.instance is None or true.marking is None:
+                        raise InputError("the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s")
+                    own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
+                    for found, value in zip(maps.values(), own, strict=True):
+                        found.append(value)
+                    if len(maps["moving"]) <= writer.done:
+                        writer.skip(view)  # an interrupted run wrote it
+                    else:
+                        writer.add(true.seen)
+                    bar.advance()
+            store.write_safetensors(out / path.name / MOVING_FILE, {k: np.stack(v) for k, v in maps.items()})
+
+
+def stored_truth(folder: Path) -> Truth:
+    """Truth that ``write_truth`` left in a folder. A view that it lacks is an InputError."""
+    sets = {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
+    maps = {name: store.read_safetensors(folder / name / MOVING_FILE) for name in sets}
+
+    def find(view: View, _frame: Frame | None, name: str) -> ViewTruth:
+        stored = sets.get(name)
+        if stored is None:
+            raise InputError(
+                "the folder of ground truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
+            )
+        index = min(range(len(stored)), key=lambda i: abs(stored.views[i].time_s - view.time_s))
+        there = stored.views[index]
+        distance_m = apart_m(there, view)
+        same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
+        if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
+            raise InputError(
+                "the stored ground truth shows another view", where=f"{folder / name}, view {index}",
+                expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
+                got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
+            )  # fmt: skip
+        own = maps[name]
+        moving = torch.from_numpy(own["moving"][index].astype(bool))[None]
+        return ViewTruth(stored[index], moving, own["instance"][index], own["marking"][index].astype(bool))
+
+    return Truth(True, find, stored=True)
+
+
+def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
+    """A recorded frame at the common size, with measured depth and the labels the log came with, never guessed ones."""
+    height, width = view.camera.height, view.camera.width
+
+    def label(name: str) -> NDArray[Any] | None:
+        if (
+            name not in frame.labels or f"{name}_confidence" in frame.labels
+        ):  # a label with a confidence is a labeller's
+            return None
+        return resize_nearest(read_label(scene, frame, name), height, width)
+
+    semantics, depth, ego = label("semantics"), label("depth"), label("ego")
+    return Observation(
+        view=view,
+        rgb=resize_rgb(torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255, height, width),
+        depth=_lidar_depth(scene, view) if depth is None else torch.from_numpy(depth.copy())[None],
+        semantics=None if semantics is None else torch.from_numpy(semantics.astype(np.int64)),
+        confidence=torch.ones(1, height, width),
+        mask=torch.ones(1, height, width, dtype=torch.bool) if ego is None else torch.from_numpy(ego == 0)[None],
+        kind="recorded", source="camera",
+    )  # fmt: skip
+
+
+def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
+    """Depth f32[1, H, W] of the sweep taken with this frame (NaN where no point fell), or None without such a sweep."""
+    sweeps = [s for s in scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
+    if not sweeps:
+        return None
+    clouds = [(sweep, read_points(scene, sweep).xyz) for sweep in sweeps]
+    world = np.concatenate([geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]).astype(np.float32)
+    gap_deg = max(largest_beam_gap(xyz) for _, xyz in clouds)
+    return torch.from_numpy(visible_depth(view, world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M))[None]
+
+
+# the LiDAR points of a log, for truth at views that no camera recorded ------------------------------------------------
+
+
+MERGED_SWEEPS: Final = 6
+"""Sweeps of each LiDAR whose points tell what the shown cameras saw."""
+KEPT_SWEEPS: Final = 96
+
+
+class LogPoints:
+    """The LiDAR points of a log; threads may ask. The sweeps asked for last are kept."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._rules = FusionRules()
+        self.dynamic: tuple[Track, ...] = tuple(t for t in scene.tracks if judge_track(t, self._rules).moving)
+        self._sensors: dict[str, list[Sweep]] = {}
+        for sweep in scene.sweeps:
+            self._sensors.setdefault(sweep.sensor, []).append(sweep)
+        self._kept: dict[str, OwnedPoints] = {}
+        self._lock = threading.Lock()
+
+    def of_moment(self, time_s: float) -> OwnedPoints | None:
+        """Points of the sweep of each LiDAR that was taken with an image, or None without one."""
+        near = [nearest_sweeps(sweeps, time_s, 1) for sweeps in self._sensors.values()]
+        return self._merged([s for found in near for s in found if abs(s.time_s - time_s) <= SAME_SWEEP_S])
+
+    def around(self, time_s: float, count: int = MERGED_SWEEPS) -> OwnedPoints | None:
+        """Points of the ``count`` sweeps of each LiDAR that are nearest in time, or None where none is near."""
+        return self._merged([s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, count)])
+
+    def placed(self, points: OwnedPoints, time_s: float) -> NDArray[np.float32]:
+        """Where points are at a moment, f32[N, 3] in the world; NaN where their object has no box then."""
+        return points_seen.placed(points, self.dynamic, time_s)
+
+    def colors(
+        self, frame: Frame, points: OwnedPoints, world: NDArray[np.float32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Colours u8[N + 1, 3] that points have in a recorded image, and where it shows them (``points_seen.carried``)."""
+        return points_seen.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
+
+    def truth_at(self, view: View, frame: Frame | None) -> PointTruth | None:
+        """What the points of the sweeps taken with a view say about it; None without such sweeps.
+
+        Args:
+            frame: the recorded image of that time, which gives the points' colours and classes, or None.
+        """
+        points = self.of_moment(view.time_s)
+        if points is None or not len(points.xyz):
+            return None
+        world = self.placed(points, view.time_s)
+        depth, index = points_seen.visible(view, world, points.gap_deg)
+        color, colored = np.zeros((len(world) + 1, 3), np.uint8), np.zeros(len(world) + 1, bool)
+        ids = np.append(points.ids, np.uint8(palette.UNLABELLED))
+        if frame is not None:
+            color, colored = self.colors(frame, points, world)
+            if "semantics" in frame.labels and (ids == palette.UNLABELLED).all():
+                label = np.asarray(read_label(self.scene, frame, "semantics"), np.uint8)
+                camera = frame.view.camera
+                label = resize_nearest(label, camera.height, camera.width)
+                values, known = points_seen.carried(frame.view, label, world, points.gap_deg)
+                ids = np.where(known, values, np.uint8(palette.UNLABELLED))
+        dynamic = np.append(points.owner != STATIC, False)[index]
+        return PointTruth(depth, dynamic, color[index], colored[index], ids[index])
+
+    def _merged(self, sweeps: Sequence[Sweep]) -> OwnedPoints | None:
+        if not sweeps:
+            return None
+        parts = [self._read(sweep) for sweep in sweeps]
+        joined = [np.concatenate([getattr(part, name) for part in parts]) for name in ("xyz", "owner", "ids")]
+        return OwnedPoints(*joined, gap_deg=min(part.gap_deg for part in parts))
+
+    def _read(self, sweep: Sweep) -> OwnedPoints:
+        kept = self._kept.get(sweep.id)
+        if kept is None:
+            points = read_points(self.scene, sweep)
+            owner, owned = separate(
+                SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), self.dynamic, self._rules
+            )
+            xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
+            for number, local in owned.items():
+                xyz[owner == number] = local
+            ids = points.classes
+            known = np.full(len(xyz), palette.UNLABELLED, np.uint8) if ids is None else ids
+            kept = OwnedPoints(xyz, owner, known, largest_beam_gap(points.xyz))
+            with self._lock:
+                while len(self._kept) >= KEPT_SWEEPS:
+                    del self._kept[next(iter(self._kept))]
+                self._kept[sweep.id] = kept
+        return kept
+
+
+def shown_frame(scene: Scene, frame: Frame, rgb: NDArray[np.uint8]) -> ShownFrame | None:
+    """A frame with its dense depth, or None if it has no label of that kind."""
+    if "depth" not in frame.labels:
+        return None
+    depth = read_label(scene, frame, "depth")
+    return ShownFrame(
+        frame.view, np.where(np.isfinite(depth), depth, np.inf).astype(np.float32), points_seen.blurred(rgb)
+    )

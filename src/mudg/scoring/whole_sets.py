@@ -1,0 +1,228 @@
+"""What compares whole sets of views after they have been scored one by one: distances of images and clips, detectors, and anchors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import log
+from mudg.base.errors import InputError
+from mudg.base.types import Scene
+from mudg.core.pictures import to_bytes
+from mudg.editing.view_settings import ScoreConfig
+from mudg.scene.observations import ObservationSet, read_observations
+from mudg.scoring import detections
+from mudg.scoring.detections import Detections, ViewImages, detections_of
+from mudg.scoring.facts import ANCHORED, Reference, ScoredTrajectory
+from mudg.scoring.sets import (
+    ClipScores,
+    DinoScores,
+    Distributions,
+    ImageSet,
+    TrajectorySets,
+    VideoDistances,
+    VideoFeatures,
+    clip_of,
+    dino_of,
+    distributions_of,
+    videos_of,
+)
+
+BASELINE: Final = "nearest_fill"
+OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
+    "dinov2": ("fd_dinov2", "subject_consistency"),
+    "clip": ("cmmd", "clip_f", "clip_v"),
+    "video_features": ("video_frechet", "video_mmd"),
+}
+"""Entry of metrics.json -> its metrics."""
+
+
+@dataclass(frozen=True)
+class SetScores:
+    """What is computed of whole sets; None where its weights or files were not given."""
+
+    distributions: Distributions | None
+    videos: VideoDistances | None
+    dinov2: DinoScores | None
+    clip: ClipScores | None
+    video_features: VideoFeatures | None
+    detections: Detections
+
+    def add_to(
+        self,
+        results: Sequence[dict[str, Any]],
+        trajectories: Sequence[ScoredTrajectory],
+        reference: Reference,
+        out: Path,
+    ) -> None:
+        """Add to the results what compares whole sets of views."""
+        if not self.records():
+            return
+        with log.task("features", len(results)) as bar:
+            for trajectory in trajectories:
+                bar.update(trajectory.name)
+                self._add(trajectory, [r for r in results if r["trajectory"] == trajectory.name], reference, out)
+                bar.advance(sum(r["trajectory"] == trajectory.name for r in results))
+
+    def _add(
+        self, trajectory: ScoredTrajectory, rows: Sequence[dict[str, Any]], reference: Reference, out: Path
+    ) -> None:
+        counted = trajectory.counted(reference.held_out)
+        if self.distributions is not None:
+            _add_distributions(rows, self.distributions, _sets_of(trajectory, reference, out, counted))
+        every = _sets_of(trajectory, reference, out, range(len(trajectory.views)))
+        if self.videos is not None:
+            _add_videos(rows, self.videos, every)
+        for name, embedded in (("dinov2", self.dinov2), ("clip", self.clip)):
+            if embedded is not None:
+                _add_named(rows, name, embedded.of(every, counted, trajectory.views))
+        if self.video_features is not None:
+            _add_named(
+                rows,
+                "video_features",
+                self.video_features.of(trajectory.name, trajectory.camera, [r["method"] for r in rows]),
+            )
+        _add_detections(rows, self.detections, trajectory, counted, reference)
+
+    def records(self) -> dict[str, Any]:
+        """How the numbers were made, by entry of metrics.json."""
+        given = {
+            "distributions": self.distributions, "videos": self.videos, "dinov2": self.dinov2, "clip": self.clip,
+            "video_features": self.video_features,
+        }  # fmt: skip
+        found = {name: source.record() for name, source in given.items() if source is not None}
+        return {**found, **({"detections": made} if (made := self.detections.record()) else {})}
+
+
+def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
+    """What the given weights and files allow to compute.
+
+    Raises:
+        InputError: a file is missing, damaged, or holds another network.
+    """
+    return SetScores(
+        distributions_of(config, scene, out), videos_of(config, scene, out), dino_of(config, scene, out), clip_of(config, scene, out),
+        VideoFeatures(Path(config.video_features)) if config.video_features else None, detections_of(config, scene),
+    )  # fmt: skip
+
+
+def anchors_of(
+    results: Sequence[dict[str, Any]], trajectories: Sequence[ScoredTrajectory], reference: Reference
+) -> list[dict[str, Any]]:
+    """What stands beside a metric's values on a trajectory: the same of the true images (``truth``), of the recorded images at their own
+    views (``recorded``), and of ``nearest_fill``. Taken out of the results."""
+    found = []
+    for trajectory in trajectories:
+        rows = [row for row in results if row["trajectory"] == trajectory.name]
+        anchors: dict[str, dict[str, float]] = {}
+        for row in rows:
+            for name, value in row.pop("truth", {}).items():
+                anchors.setdefault(name, {})["truth"] = value
+            for name, own in row.pop("anchors", {}).items():
+                anchors.setdefault(name, {}).update(own)
+        for name, value in (
+            reference.facts.recorded(trajectory.camera) if set(ANCHORED) & anchors.keys() else {}
+        ).items():
+            if name in anchors:
+                anchors[name]["recorded"] = value
+        for row in rows:
+            if row["method"] == BASELINE:
+                for name, own in anchors.items():
+                    if not isinstance(row["values"].get(name), str):
+                        own[BASELINE] = row["values"][name]
+        found += [{"trajectory": trajectory.name, "metric": name, **own} for name, own in sorted(anchors.items())]
+    return found
+
+
+def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]) -> TrajectorySets:
+    """The images at the counted views of a trajectory whose views have been scored and written."""
+
+    def chosen(found: ObservationSet, indices: Sequence[int]) -> ImageSet:
+        return ImageSet(len(counted), lambda number: found.rgb_u8(indices[counted[number]]))
+
+    def true_image(number: int) -> NDArray[np.uint8]:
+        place = counted[number]
+        true = reference.truth.at_view(trajectory.views[place], trajectory.frames[place], trajectory.name)
+        if true is None:
+            raise InputError("a view has no ground truth", where=f"{trajectory.name}, view {place}")
+        return to_bytes(true.seen.rgb)
+
+    methods = {name: chosen(found, trajectory.indices[name]) for name, found in trajectory.sets.items()}
+    every = range(len(trajectory.views))
+    if reference.baseline is not None:
+        methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
+    truth = None
+    if reference.truth.exact and trajectory.shift_m != 0.0:
+        drawn = out / "truth" / trajectory.name
+        truth = (
+            ImageSet(len(counted), true_image) if reference.truth.stored else chosen(read_observations(drawn), every)
+        )
+    camera = trajectory.views[0].camera
+    return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
+
+
+def _add_videos(rows: Sequence[dict[str, Any]], videos: VideoDistances, here: TrajectorySets) -> None:
+    """FVD into the results of one trajectory."""
+    found = videos.of(here)
+    for row in rows:
+        value = found[row["method"]]
+        row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
+        if not isinstance(value, str):
+            row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
+
+
+def _add_distributions(rows: Sequence[dict[str, Any]], sets: Distributions, here: TrajectorySets) -> None:
+    """FID and KID into the results of one trajectory."""
+    found = sets.of(here)
+    for row in rows:
+        value = found[row["method"]]
+        if isinstance(value, str):
+            row["values"] |= {"fid": value, "kid": value}
+        else:
+            row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
+            row["distribution"] = value.record()
+
+
+def _add_named(rows: Sequence[dict[str, Any]], entry: str, found: Mapping[str, dict[str, Any] | str]) -> None:
+    """Values of several metrics by method, and what stands beside them, into the results of one trajectory."""
+    for row in rows:
+        of = found[row["method"]]
+        row["values"] |= dict(of["values"]) if not isinstance(of, str) else dict.fromkeys(OF_ENTRY[entry], of)
+        if not isinstance(of, str) and "n" in of:
+            row[entry] = {"n": of["n"], "n_reference": of["n_reference"]}
+
+
+def _add_detections(
+    rows: Sequence[dict[str, Any]],
+    found: Detections,
+    trajectory: ScoredTrajectory,
+    counted: Sequence[int],
+    reference: Reference,
+) -> None:
+    """NTA-IoU and NTL-IoU into the results of one trajectory, with their anchors."""
+    views = tuple(trajectory.views[n] for n in counted)
+    frames = reference.facts.frames_of(trajectory.camera)
+    there = {
+        "truth": ViewImages(f"{detections.TRUTH}/{trajectory.name}", tuple(counted), views),
+        "recorded": ViewImages(
+            f"{detections.RECORDED}/{trajectory.camera}", tuple(range(len(frames))), tuple(f.view for f in frames)
+        ),
+    }
+    for metric, (entry, of) in found.rows.items():
+        beside = {name: value["value"] for name, images in there.items() if not isinstance(value := of(images), str)}
+        for row in rows:
+            indices = trajectory.indices.get(row["method"], tuple(range(len(trajectory.views))))
+            images = ViewImages(f"{row['method']}/{trajectory.name}", tuple(indices[n] for n in counted), views)
+            value = of(images)
+            row["values"][metric] = value if isinstance(value, str) else value["value"]
+            row.setdefault("anchors", {})[metric] = beside
+            if isinstance(value, str):
+                continue
+            row[entry] = {k: v for k, v in value.items() if k != "value"}
+            if found.lanes is not None and entry == "ntl":
+                row[entry]["against_detector"] = found.lanes.against(images, there["truth"])

@@ -1,1 +1,0 @@
-"""Parts of ``mudg export``, and of ``mudg asset import``."""

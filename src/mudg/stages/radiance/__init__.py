@@ -1,1 +1,0 @@
-"""Parts of ``fit`` and ``render`` for radiance fields (method emernerf)."""

@@ -1,0 +1,263 @@
+"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`labels/depth/depthlab.py`),
+or a network of the scores (`scoring/converted.py`).
+
+The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
+unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
+text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no modality label) are widened as the paper says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mudg.base import log, processes, store, weights
+from mudg.base.errors import InputError, UsageError
+from mudg.base.run_folder import Replacement, all_names, refuse_overlap
+from mudg.diffusion.published import model as published_files
+from mudg.diffusion.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
+from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.labels.depth import depthlab
+from mudg.networks import clip
+from mudg.networks.clip import TextTower
+from mudg.scoring.converted import convert_weights
+
+_UNET = "model.diffusion_model."
+_ENTER = _UNET + "input_blocks.0.0.weight"
+DTYPES = {"keep": None, "float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+SHARD_BYTES = 2**30
+"""Largest size of one weight file."""
+LICENCE = (
+    "Weights keep the terms of those who published them; read the page they came from before any use. The code of MuDG and of "
+    "DynamiCrafter is Apache-2.0; the data they were trained on have licences of their own (the Waymo Open Dataset is for "
+    "non-commercial use)."
+)
+
+
+def run(
+    config: ConvertConfig, checkpoint: Path, to: Path, *, overwrite: bool = False, network: PublishedConfig | None = None
+) -> Path:
+    """Convert one checkpoint; returns `to`, which is complete or not there.
+
+    Args:
+        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
+        to: folder of the model; replaced only with `overwrite`.
+        network: sizes of the network the checkpoint should hold (None: the published ones).
+
+    Raises:
+        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is written.
+        ResourceError: memory limit or disk.
+    """
+    checkpoint, to = Path(checkpoint), Path(to)
+    refuse_overlap(to, {"checkpoint": checkpoint, "towers": config.towers})
+    replacement = Replacement.at(to)
+    replacement.recover(_holds_model, own_names)
+    replaces = to.exists()
+    if replaces and not overwrite:
+        raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
+    if replaces and not _holds_model(to):
+        raise UsageError("the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to")
+    place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
+    if config.network != "diffusion":
+        work, limit = _of_scores(config, checkpoint, place)
+    elif checkpoint.is_dir():
+        work, limit = _from_folder(config, checkpoint, place)
+    else:
+        work, limit = _from_file(config, checkpoint, place, network)
+    if replaces:
+        replacement.begin()
+    try:
+        with log.task("convert", 1) as bar:
+            peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
+            bar.advance()
+        if replaces:
+            replacement.swap(own_names)
+    finally:
+        with contextlib.suppress(OSError):  # there and empty only if converting failed
+            replacement.staging.rmdir()
+    memory = f"; peak memory {peak / processes.GIB:.1f} GiB, pages of the mapped file included" if peak else ""
+    log.info(f"convert: {to} is complete{memory}")
+    return to
+
+
+def _holds_model(folder: Path) -> bool:
+    """Whether a folder holds a model that was converted, or trained, by this program."""
+    return bool(own_names(folder))
+
+
+def own_names(folder: Path) -> list[str]:
+    """Names of the files that a model folder's description lists, and its own last; none if there is no such description."""
+    try:
+        content = store.read_json(folder / "model.json")
+        files = list(content["files"]) if "files" in content else []
+        files += [f"{part}/{name}" for part, entry in content.get("parts", {}).items() for name in entry["files"]]
+        there = set(all_names(folder))
+        return [name for name in (*files, "MODEL_CARD.md", "model.json") if name in there] if files else []
+    except (InputError, KeyError, TypeError, AttributeError):
+        return []
+
+
+Work = Callable[[], None]
+
+
+def _from_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None) -> tuple[Work, int]:
+    """The conversion of a checkpoint, and the address space it may take."""
+    if not checkpoint.is_file():
+        raise InputError("no such checkpoint", where=str(checkpoint))
+    height, width = resolution(config, checkpoint)
+    network = replace(network or PublishedConfig(), height=height, width=width)
+    towers = [Path(config.towers)] if config.towers and Path(config.towers).is_file() else []
+    return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
+
+
+def _of_scores(config: ConvertConfig, checkpoint: Path, to: Path) -> tuple[Work, int]:
+    """The conversion of a network of the scores, and the address space it may take."""
+    if config.resolution != "auto" or config.towers or config.dtype != "keep":
+        raise UsageError("--resolution, --towers and --dtype apply to diffusion models only", where=f"--network {config.network}")
+    if not checkpoint.is_file():
+        raise InputError("no such checkpoint", where=str(checkpoint))
+    limit = memory_limit(config, checkpoint, checkpoint)  # read, and converted to float32
+    return functools.partial(convert_weights, config.network, checkpoint, to), limit
+
+
+def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, int]:
+    """The conversion of DepthLab's files, and the address space it may take."""
+    if config.resolution != "auto" or config.towers:
+        raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(folder),
+                         remedy="leave them out, or give a checkpoint file")  # fmt: skip
+    files = depthlab.find(folder).files()
+    dtype = DTYPES[config.dtype]
+    return functools.partial(depthlab.convert_folder, folder, to, dtype, SHARD_BYTES), memory_limit(config, *files)
+
+
+def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
+    """Height and width that the checkpoint was trained at: as configured, else from the file's name."""
+    if config.resolution != "auto":
+        height, width = config.resolution.split("x")
+        return int(height), int(width)
+    for part in (checkpoint.name, checkpoint.parent.name):
+        for mark, size in (("1024", (576, 1024)), ("512", (320, 512))):
+            if mark in part:
+                return size
+    raise UsageError(
+        "the training resolution is not in the file's name", where=str(checkpoint), expected="512 or 1024 in the name",
+        remedy="add --resolution 320x512 or --resolution 576x1024",
+    )  # fmt: skip
+
+
+def memory_limit(config: ConvertConfig, *files: Path) -> int:
+    """Address space in bytes that conversion may add to what a process with torch has.
+
+    The files, mapped (or read, and then copied once, where their format cannot be mapped), twice the largest weight file
+    written, 3 GiB for working.
+    """
+    if config.memory_gb:
+        return int(config.memory_gb * 1e9)
+    read = sum(path.stat().st_size * (1 if zipfile.is_zipfile(path) else 2) for path in files)
+    return read + 2 * SHARD_BYTES + 3 * processes.GIB
+
+
+def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig) -> None:
+    """The conversion itself, in this process (see `run` for errors)."""
+    found = weights.read_checkpoint(checkpoint)
+    if config.towers:
+        found = weights.with_towers(found, weights.read_checkpoint(Path(config.towers)))
+    refuse_relatives(found, checkpoint)
+    found, adapted = widen(found)
+    tensors = weights.match(found, wanted_shapes(network), str(checkpoint))
+    _check_values(found, tensors, checkpoint)
+    base_scale = float(tensors["scale"][-1])
+    network = replace(network, schedule=replace(network.schedule, base_scale=base_scale))
+    text = {name.removeprefix("text."): tensors.pop(name) for name in list(tensors) if name.startswith("text.")}
+    tensors["text"] = embed_captions(network, text)
+    facts = {
+        "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
+        "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
+    }  # fmt: skip
+    dtype = DTYPES[config.dtype]
+    published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
+
+
+def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
+    """InputError for DynamiCrafter-256, which looks alike and is another model."""
+    marks = [name for name in found if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
+    if marks:
+        raise InputError("this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where),
+            got=", ".join(marks[:3]),
+            expected="MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule that never "
+            "reaches pure noise and no dynamic rescale, and weights its image attention with learned factors",
+            remedy="take the 512 or 1024 checkpoint",
+        )  # fmt: skip
+
+
+def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+    """A checkpoint with 8 input channels made one with 12 and a modality label; others unchanged. Also says what was done.
+
+    The condition's four input channels are used twice, for colour and for depth, and the whole kernel, noise channels
+    included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the published training.
+    """
+    tensors = dict(found)
+    kernel = tensors.get(_ENTER)
+    if kernel is None or kernel.ndim != 4 or kernel.shape[1] % 2 or any(".class_embed." in name for name in tensors):
+        return tensors, ""
+    latent = kernel.shape[1] // 2
+    tensors[_ENTER] = torch.cat([kernel, kernel[:, latent:]], 1) * 0.5
+    for name in list(tensors):
+        if name.startswith(_UNET + "time_embed."):
+            tensors[name.replace(".time_embed.", ".class_embed.")] = tensors[name].clone()
+    done = f"{2 * latent} input channels widened to {3 * latent}, label embedding copied from that of the noise step"
+    return tensors, done + "; not trained since"
+
+
+def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
+    """Our name -> shape of everything that a checkpoint must hold: the model, the text tower, the table of the dynamic rescale."""
+    with torch.device("meta"):
+        model, tower = PublishedMDM(network), TextTower(network.text, network.vocabulary)
+    shapes = {name: tuple(value.shape) for name, value in model.state_dict().items() if name != "text"}
+    shapes |= {f"text.{name}": tuple(value.shape) for name, value in tower.state_dict().items()}
+    return shapes | {"scale": (SCALE_ENTRIES,)}
+
+
+def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
+    """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0, 1]."""
+    weights.refuse_bad_values(tensors, str(where))
+    scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
+    if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
+        raise InputError(
+            "the dynamic rescale table is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
+            got=f"{float(scale.min())} .. {float(scale.max())}",
+        )  # fmt: skip
+    if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
+        raise InputError(
+            "the checkpoint's noise schedule keeps signal at its last step", where=f"{where}: alphas_cumprod[-1]", expected="0",
+            got=str(float(alpha_bar.flatten()[-1])), remedy="take a MuDG or DynamiCrafter checkpoint; this is another model",
+        )  # fmt: skip
+
+
+@torch.no_grad()
+def embed_captions(network: PublishedConfig, tower_weights: Mapping[str, Tensor]) -> Tensor:
+    """Token vectors f32[2,77,D] of the published caption and of the empty one, by the checkpoint's own text tower."""
+    with torch.device("meta"):
+        tower = TextTower(network.text, network.vocabulary)
+    tower.load_state_dict({n: t if n == "tokens.weight" else t.float() for n, t in tower_weights.items()}, assign=True)
+    ids = torch.stack([clip.padded_tokens(clip.CAPTION_IDS), clip.padded_tokens(clip.EMPTY_IDS)])
+    tower.tokens = torch.nn.Embedding.from_pretrained(tower.tokens.weight[ids.flatten()].float())
+    return tower.eval()(torch.arange(ids.numel()).view_as(ids)).float()
+
+
+def _card(network: PublishedConfig, facts: Mapping[str, Any]) -> str:
+    adapted = facts["adapted"] or "nothing"
+    return (
+        f"# Diffusion model converted from {facts['source']['file']}\n\n"
+        f"Trained at {network.width}x{network.height}, {network.window} frames. SHA-256 of the source: {facts['source']['sha256']}.\n"
+        f"Adapted: {adapted}. Dynamic rescale down to {facts['base_scale']:g}, as the checkpoint says.\n\n"
+        f"## Licence\n\n{facts['licence']}\n"
+    )

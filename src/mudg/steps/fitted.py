@@ -1,0 +1,176 @@
+"""A fitted scene in memory: look at its objects, edit them, render any camera at any pose and time to numpy arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mudg.base.errors import InputError, UsageError
+from mudg.base.geometry import rigid_problem
+from mudg.base.types import Camera, Scene, View
+
+if TYPE_CHECKING:
+    from mudg.gaussians.model import SceneModel
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One rendered view as numpy arrays.
+
+    Args:
+        rgb: u8[H, W, 3].
+        depth_m: f32[H, W], camera z in metres, NaN in the sky and where the scene is empty.
+        classes: u8[H, W] Cityscapes train ids (255 = none), or None if the scene was fitted without classes.
+        coverage: f32[H, W] in 0..1, how much of the pixel Gaussians cover.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    classes: NDArray[np.uint8] | None
+    coverage: NDArray[np.float32]
+
+
+def read_scene(folder: str | Path) -> Scene:
+    """Read a scene written by ingest or annotate, the one of a run, or the one that a fit belongs to.
+
+    Raises:
+        InputError: nothing is there, or something else. IntegrityError: a file was altered.
+    """
+    from mudg.editing.runs import scene_at
+    from mudg.scene.read import read_scene
+
+    return read_scene(scene_at(Path(folder)))
+
+
+class FittedScene:
+    """A scene made by ``mudg fit``. Edits return a changed copy."""
+
+    def __init__(self, model: SceneModel) -> None:
+        self._model = model
+
+    @classmethod
+    def read(cls, folder: str | Path, device: str = "auto") -> FittedScene:
+        """Read the folder of a finished fit, or the best fit of a run.
+
+        Args:
+            device: where it is rendered: ``auto`` (CUDA if there is one), ``cpu``, ``cuda``, ``cuda:N``.
+
+        Raises:
+            InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no such device.
+        """
+        from mudg.core.raster.place import drawing_device
+        from mudg.editing.runs import fit_at
+        from mudg.gaussians.fit import load_model
+
+        return cls(load_model(fit_at(Path(folder))).to(drawing_device(device, "render")))
+
+    @property
+    def method(self) -> str:
+        """The method it was fitted with, e.g. ``mudg_s``."""
+        return str(self._model.facts.get("method", ""))
+
+    @property
+    def object_ids(self) -> tuple[str, ...]:
+        """Track ids of the dynamic objects that have Gaussians of their own."""
+        return self._model.node_names()
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self._model.table)
+
+    def object_pose(self, track_id: str, time_s: float) -> NDArray[np.float64] | None:
+        """World pose f64[4, 4] of an object's box at a time; None where the object is not there.
+
+        Raises:
+            UsageError: no such object.
+        """
+        return self._model.dynamic_object(track_id).pose_matrix(time_s)
+
+    def without(self, *track_ids: str) -> FittedScene:
+        """The scene without these objects.
+
+        Raises:
+            UsageError: an object that the scene does not have (it may be parked, and so part of the background).
+        """
+        return FittedScene(self._model.without_nodes(track_ids))
+
+    def moved(self, track_id: str, object_from_new: ArrayLike) -> FittedScene:
+        """The scene with one object displaced in its own frame (x forward, y left, z up, metres) at all times.
+
+        Args:
+            object_from_new: rigid 4x4; the new pose is ``object_pose @ object_from_new``. A translation by (3, 0, 0) moves it 3 m ahead.
+
+        Raises:
+            UsageError: no such object. InputError: the displacement is not rigid.
+        """
+        matrix = np.asarray(object_from_new, np.float64)
+        problem = rigid_problem(matrix)
+        if problem:
+            raise InputError(f"the displacement is not rigid: {problem}", where="object_from_new")
+        return FittedScene(self._model.with_object_moved(track_id, matrix))
+
+    def edited(self, script: str | Path, scene: Scene | None = None) -> FittedScene:
+        """The scene with an edit script carried out (``docs/edit.md``).
+
+        Args:
+            script: YAML file. scene: the log that it was fitted to; with it, parked objects and the vehicle can be edited.
+
+        Raises:
+            InputError: the script is not valid, or asks for what cannot be done here.
+        """
+        from mudg.editing.carried import carry_out
+        from mudg.editing.script import read_edits
+
+        drive = carry_out(read_edits(script), self._model, scene)
+        return FittedScene(drive.model(self._model, keep_ego=True))
+
+    def export_asset(self, track_id: str, out: str | Path, scene: Scene | None = None) -> Path:
+        """Write one object to a file that edit scripts can insert.
+
+        Args:
+            out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which it was seen.
+        """
+        from mudg.base.run_folder import ResultFile
+        from mudg.editing.assets import complete_asset, write_asset
+        from mudg.editing.model import asset_of
+
+        model, views = self._model, () if scene is None else tuple(frame.view for frame in scene.frames)
+        asset = complete_asset(model, track_id, views) if views else asset_of(model, track_id)
+        with ResultFile.open(Path(out), "asset export", {"id": track_id}, {}, overwrite=True) as file:
+            write_asset(file.staged(), asset)
+            return file.finish({"id": track_id})
+
+    def render(self, camera: Camera, world_from_cam: ArrayLike, time_s: float, *, backend: str = "auto") -> Picture:
+        """Render a camera at a pose and time.
+
+        Args:
+            camera: size and intrinsics in pixels.
+            world_from_cam: rigid 4x4 pose; camera axes x right, y down, z forward.
+            time_s: seconds on the scene's clock. Objects stand where they were then; outside their tracks they are absent.
+            backend: ``auto``, ``cpu``, ``torch`` or ``gsplat``.
+
+        Raises:
+            UsageError: not a camera. InputError: the pose is not rigid. ResourceError: the backend is not available.
+        """
+        import torch
+
+        from mudg.core.pictures import to_bytes
+        from mudg.gaussians.rendering import raster_of, render_view
+
+        if not isinstance(camera, Camera):
+            raise UsageError(
+                "the camera is not a mudg.Camera",
+                expected='e.g. scene.frames_of("front")[0].view.camera',
+                got=repr(camera),
+            )
+        view = View(camera, np.asarray(world_from_cam, np.float64), float(time_s))
+        with torch.no_grad():
+            seen = render_view(self._model, view, raster_of(self._model, backend))  # type: ignore[arg-type]
+        rgb = to_bytes(seen.rgb)
+        classes = None if seen.semantics is None else seen.semantics.numpy().astype(np.uint8)
+        depth = np.full(rgb.shape[:2], np.nan, np.float32) if seen.depth is None else seen.depth[0].numpy()
+        return Picture(rgb, depth, classes, seen.confidence[0].numpy())

@@ -1,0 +1,94 @@
+"""Presets of ``mudg run``, ``mudg demo`` and ``mudg bench``: rows of plain values over the defaults of every verb.
+
+Precedence: defaults < preset < ``--config`` < flags. Every preset is a configuration of the same code and runs on a CPU too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final, Literal, get_args
+
+from mudg.base.errors import UsageError
+from mudg.steps.settings.run import RunConfig, with_lines
+
+PresetName = Literal["fast", "default", "quality", "paper"]
+
+DEMO_CITY = 3
+"""Seed of the city that `mudg demo` shows: a crossing by day, much traffic, a cyclist, a car that turns."""
+NO_MODEL: Final = "published"
+"""Stands where a published-type model's folder must be given."""
+
+Value = bool | int | float | str | tuple[str, ...] | tuple[float, ...]
+PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
+    "fast": {
+        "ingest.city.n_frames": 12, "ingest.city.width": 240, "ingest.city.height": 160, "ingest.city.cameras": ("front",),
+        "ingest.resolution": "480", "adaptation": "off",
+        "fit.iterations": 250, "synthesize.steps": 1, "synthesize.shifts_m": (3.0, -3.0), "render.shifts_m": (0.0, 3.0, -3.0),
+    },
+    "default": {
+        "ingest.city.n_frames": 24, "ingest.city.width": 384, "ingest.city.height": 256,
+        "fit.iterations": 1000, "synthesize.steps": 2,
+    },
+    "quality": {
+        "ingest.city.n_frames": 60, "ingest.city.width": 960, "ingest.city.height": 640,
+        "fit.iterations": 30_000, "fit.checkpoint_every": 2500, "fit.preview_every": 2500,
+        "fit.start.gaussians": 1_000_000, "fit.start.voxel_m": 0.08, "fit.densify.max_gaussians": 3_000_000,
+        "fit.loss.semantic_every": 1, "fit.virtual.gaussians": 200_000, "fit.virtual.half_size": 0.0,
+        "synthesize.steps": 2,  # of the shipped model; more lowered its scores (docs/diffusion.md)
+    },
+    "paper": {
+        "adaptation": "off", "continue_fit": False,
+        "ingest.city.n_frames": 60, "ingest.city.width": 960, "ingest.city.height": 640,
+        "fuse.match_colors": False, "fuse.occlusion_test": False, "fuse.box_growth_m": 0.0, "fuse.floor_margin_m": 0.25,
+        "fuse.moving_distance_m": 0.5, "fuse.min_object_points": 100,
+        "synthesize.model": NO_MODEL, "synthesize.steps": 50, "synthesize.sampler": "ddim", "synthesize.eta": 1.0,
+        "synthesize.guidance": 7.5, "synthesize.guidance_rescale": 0.7, "synthesize.overlap": 8, "synthesize.align_depth": False,
+        "synthesize.full_size": False,
+        "fit.iterations": 30_000, "fit.checkpoint_every": 2500, "fit.preview_every": 2500, "fit.sh_degree": 3,
+        "fit.start.gaussians": 10_000_000, "fit.start.voxel_m": 0.15, "fit.densify.kind": "gradient",
+        "fit.densify.max_gaussians": 10_000_000, "fit.densify.longest_to_middle": 1e6,  # no such limits are published
+        "fit.objects.deformable": False, "fit.poses.learn": True, "fit.poses.start": 0.1,
+        "fit.loss.ssim_weight": 0.2, "fit.loss.lidar_weight": 0.1, "fit.loss.sky_weight": 0.05, "fit.loss.semantic_weight": 0.0,
+        "fit.loss.object_weight": 0.1,
+        "fit.virtual.probability": 0.2, "fit.virtual.beside": False, "fit.virtual.start": 0.1, "fit.virtual.stop": 1.0,
+        "fit.virtual.gaussians": 0, "fit.virtual.confidence_power": 0.0, "fit.virtual.color_weight": 0.0,
+        "fit.virtual.perceptual_weight": 0.1, "fit.virtual.perception": "lpips", "fit.virtual.depth_weight": 0.1,
+        "fit.virtual.lidar_weight": 0.0, "fit.virtual.sky_weight": 0.0, "fit.virtual.semantic_weight": 0.1, "fit.virtual.half_size": 0.0,
+    },
+}  # fmt: skip
+"""Preset -> setting -> value; settings that are not named have their defaults."""
+
+
+def run_preset(name: PresetName = "default") -> RunConfig:
+    """The chain's settings before any file or flag; the first camera of whatever scene it is.
+
+    Raises:
+        UsageError: no such preset.
+    """
+    if name not in PRESETS:
+        raise UsageError("no such preset", where="--preset", expected=", ".join(get_args(PresetName)), got=repr(name))
+    config = _with(with_lines(RunConfig(), cameras=()), {"ingest.city.seed": DEMO_CITY})
+    return _with(config, PRESETS[name])
+
+
+def chosen_preset(name: PresetName | None, fast: bool) -> PresetName:
+    """The preset that ``--preset`` and ``--fast`` ask for; UsageError where they contradict each other."""
+    if fast and name not in (None, "fast"):
+        raise UsageError(
+            "--fast is another name of --preset fast", where="--preset", got=str(name), remedy="leave one of them out"
+        )
+    return "fast" if fast else name or "default"
+
+
+def _with(config: Any, values: Mapping[str, Any]) -> Any:
+    """A configuration with other values, by dotted names."""
+    groups: dict[str, dict[str, Any]] = {}
+    own: dict[str, Any] = {}
+    for key, value in values.items():
+        group, _, rest = key.partition(".")
+        if rest:
+            groups.setdefault(group, {})[rest] = value
+        else:
+            own[key] = value
+    return replace(config, **own, **{name: _with(getattr(config, name), inner) for name, inner in groups.items()})

@@ -1,0 +1,305 @@
+"""synthesize: dense colour, depth and semantics on trajectories that were never driven.
+
+For every trajectory: build the condition view by view from the fused cloud and the recorded images, run the diffusion
+model over windows of frames, write one folder of observations. Windows overlap; the shared frames are fixed in the later
+window, so that the video continues. The last window ends at the last frame: every frame of the trajectory is produced.
+
+OUT/<trajectory>/        observations (see `scene/observations.py`) and overview.png
+OUT/<trajectory>/state/  what an interrupted run needs to continue after the last finished window; removed at the end
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from mudg import native
+from mudg.base import log, memory, store
+from mudg.base.errors import UsageError
+from mudg.base.processes import run_in_processes
+from mudg.base.records import understood
+from mudg.base.types import Condition, FusedCloud, Photo, Scene, Trajectory
+from mudg.core import trajectory
+from mudg.core.fusion import SweepShots
+from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
+from mudg.core.raster.cpu import release_memory
+from mudg.diffusion import views as loading
+from mudg.diffusion.clips.condition import ConditionRules, VacatedAt
+from mudg.diffusion.clips.inputs import ConditionSources, InWeather, NearSweeps
+from mudg.diffusion.published.model import is_published
+from mudg.diffusion.requests import GeneratedClip
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.views import (
+    COLOR_ALONE,
+    EDITED_IMAGES_PER_VIEW,
+    FREEVS,
+    SOURCE,
+    PreparedImages,
+    ViewMaker,
+    recorded_images,
+    windows,
+)
+from mudg.editing import weathered as editing_weather
+from mudg.editing.recorded import DriveOfEdits, drive_of_edits, photos_of_edited, vacated_at
+from mudg.editing.script import EditScript
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_planes, render_view
+from mudg.gaussians.storage import load_model, model_of_scene
+from mudg.networks.codec import Modality
+from mudg.scene import fuse
+from mudg.scene.clouds import read_fused
+from mudg.scene.observations import ObservationWriter
+from mudg.scene.read import read_scene
+from mudg.scene.settings import FuseConfig
+
+FITS = "depth_fits.json"
+"""Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
+PROCESS_BYTES = int(1.2 * memory.GIB)
+PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
+"""What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's frames. Measured:
+2.0 GiB at 1242x375 with windows of eight frames, 3.85 GiB at 3840x2160 with three, where conditions lie in files (4.5 GiB before)."""
+WINDOW_FRAMES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class JobInputs:
+    """What every trajectory is made from: folders of the scene, its fused clouds and its fit, and the edit script."""
+
+    scene: Path
+    fused: Path
+    fitted: Path | None = None
+    script: EditScript | None = None
+
+
+def read_drive(config: SynthesizeConfig, given: JobInputs) -> Scene:
+    """The scene whose cameras are moved, as the edit script leaves it: what cannot be done is told here, before anything is written."""
+    loaded = read_scene(given.scene)
+    if given.fitted is not None:
+        model_of_scene(given.fitted, loaded)  # refuses the fit of another scene
+    return loaded if given.script is None else _edited(config, given, given.script, loaded).scene
+
+
+def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: Path) -> dict[str, Any]:
+    """Generate all trajectories of the configuration, one folder of observations each; returns a summary.
+
+    Raises:
+        UsageError: unknown camera, nothing to make.
+    """
+    cameras = config.cameras or tuple(loaded.cameras)[:1]
+    if not cameras or not (config.shifts_m or config.paths):
+        raise UsageError("nothing to synthesize", where=str(given.scene), expected="at least one camera and one shift")
+    paths = [
+        *(trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m),
+        *(trajectory.named(loaded, camera, name) for camera in cameras for name in config.paths),
+    ]
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        raise UsageError("two shifts give the same trajectory", got=", ".join(names))
+    loading.half_of(config)  # said before other processes begin
+    started = time.monotonic()
+    processes = config.processes or usual_processes(config, paths)
+    model = loading.load_any(config) if processes == 1 else None  # several processes load one each
+    try:
+        frames = _run_jobs([(config, given, out, path, model) for path in paths], names, processes)
+    finally:
+        _drive_again.cache_clear()
+    seconds = time.monotonic() - started
+    log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
+    return {"trajectories": names, "views": frames}
+
+
+def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> int:
+    """Trajectories made at the same time where the configuration names no number: as many as there are cores and as memory lasts for;
+    one where they would share a GPU. Says so where memory decides."""
+    cores = native.default_threads() if config.device == "cpu" else 1
+    wanted, free = min(cores, len(paths)), memory.free_bytes()
+    if wanted == 1 or not free:
+        return max(1, wanted)
+    camera = max((path.views[0].camera for path in paths), key=lambda c: c.width * c.height)
+    pixels = camera.width * camera.height if config.full_size else 0
+    frames = min(WINDOW_FRAMES, max(map(len, paths)))
+    need = PROCESS_BYTES + pixels * (PIXEL_BYTES + frames * FRAME_PIXEL_BYTES)
+    possible = max(1, min(wanted, free // need))
+    if possible < wanted:
+        log.info(f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
+                 f"{memory.in_words(need)}, and {memory.in_words(free)} are free")  # fmt: skip
+    return possible
+
+
+def _edited(config: SynthesizeConfig, given: JobInputs, script: EditScript, scene: Scene) -> DriveOfEdits:
+    """The drive that the script makes of scene, clouds and fit."""
+    if config.condition == FREEVS:
+        raise UsageError("this condition is made of recorded sweeps, which show no edits", where="--condition", got=FREEVS,
+            remedy="edit a whole run with `mudg edit` and give its scene")  # fmt: skip
+    told = not shows_weather(config, script, given.fitted is not None)
+    fitted = None if given.fitted is None else load_model(given.fitted)
+    return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told)
+
+
+def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
+    """Whether views are generated in the weather and light of a script: by a published-type model, from points and a reference in that
+    weather, whose distances a fit tells."""
+    asked = editing_weather.conditions_of(script.canonical())
+    wanted = asked is not None and asked.changes_air_ground_or_light and fitted and config.condition == "full"
+    return wanted and is_published(config.model)
+
+
+def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
+    """Make the trajectories, each in one thread, several processes at a time; returns the number of views."""
+    processes = min(processes, len(jobs))
+    if processes > 1:
+        release_memory()
+        log.info_once(f"synthesize: {processes} processes with one thread each")
+    made = 0
+    with log.task("synthesize", len(jobs)) as bar:
+        for index, views in run_in_processes(make_trajectory, jobs, processes):
+            made += views
+            bar.update(names[index])
+            bar.advance()
+    return made
+
+
+# one trajectory -------------------------------------------------------------------------------------------------------
+
+
+def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps:
+    """The sweeps of a scene for FreeVS' condition, each coloured by the images of its time that are not held out."""
+    times = [view.time_s for view in path.views]
+    period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.1
+
+    def read(number: int) -> SweepShots:
+        return next(iter(fuse.scene_sweeps(replace(scene, sweeps=(scene.sweeps[number],)), FuseConfig())))
+
+    return NearSweeps(tuple(sweep.time_s for sweep in scene.sweeps), read, scene.tracks, period_s, cloud.colors)
+
+
+def without_classes(cloud: FusedCloud) -> FusedCloud:
+    """The cloud without its points' classes."""
+    bare = lambda points: replace(points, semantics=None)  # noqa: E731
+    return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()}, cloud.colors)
+
+
+def make_trajectory(
+    config: SynthesizeConfig, given: JobInputs, out: Path, path: Trajectory, model: loading.DiffusionModel | None = None
+) -> int:
+    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`: that of the
+    configuration, if it is in memory already."""
+    folder = out / path.name
+    if (folder / "observations.json").is_file():
+        return len(path)
+    model = model or loading.load_any(config)
+    maker = _view_maker(config, given, path, model, out)
+    spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
+    state = folder / "state"
+    first, tail = _read_state(state)
+    with understood("depth fits of an interrupted synthesis", str(state / FITS)):
+        fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
+    every = max(1, len(path) // 5)
+    with ObservationWriter(folder, path.name, COLOR_ALONE.get(config.condition, SOURCE)) as writer:
+        done = spans[first - 1].stop if first else 0
+        for view in path.views[:done]:
+            writer.skip(maker.sized(view))
+        for number in range(first, len(spans)):
+            span = spans[number]
+            shared = done - span.start
+            known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
+            views = [path.views[i] for i in span]
+            sample, condition, observations = maker.make(views, number, known)
+            for place, (index, observation) in enumerate(zip(span, observations)):
+                if index >= done:
+                    writer.add(observation)
+                if index >= done and sample.depth_fits:
+                    fit = sample.depth_fits[place]
+                    numbers = (fit.scale, fit.shift_m, fit.residual_before, fit.residual)
+                    fits[f"{index:06d}"] = [round(x, 5) if math.isfinite(x) else None for x in numbers]
+                if index >= done and index % every == 0:
+                    row = {"row": _sheet_row(condition, sample, index - span.start)}
+                    store.write_safetensors(state / f"row{index:06d}.safetensors", row)
+            done, tail = span.stop, sample.latents
+            store.write_json(state / FITS, fits)
+            store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
+            (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
+            del sample, condition, observations, observation  # before the next window is made
+        rows = [store.read_safetensors(file)["row"] for file in sorted(state.glob("row*.safetensors"))]
+        if rows:
+            store.write_image(folder / "overview.png", np.concatenate(rows))
+        if fits:
+            store.write_json(folder / FITS, fits)
+        shutil.rmtree(state, ignore_errors=True)
+    return len(path)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drive:
+    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of a size."""
+
+    scene: Scene
+    cloud: FusedCloud
+    recorded: list[Photo]
+    fit: SceneModel | None = None
+    vacated: VacatedAt | None = None
+    weather: InWeather | None = None
+    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
+
+
+def _drive_of(config: SynthesizeConfig, given: JobInputs) -> _Drive:
+    scene, cloud = read_scene(given.scene), read_fused(given.fused)
+    fit = None if given.fitted is None else load_model(given.fitted)
+    recorded, vacated, weather = recorded_images(scene, config), None, None
+    if given.script is not None:
+        drive = drive_of_edits(given.script, scene, cloud, fit)
+        scene, cloud, fit, recorded = drive.scene, drive.cloud, drive.model, photos_of_edited(recorded, drive.plan)
+        vacated = vacated_at(drive.plan)
+        asked = editing_weather.conditions_of(given.script.canonical())
+        if asked is not None and fit is not None and shows_weather(config, given.script, True):
+            weather = editing_weather.weather_of(functools.partial(render_view, fit, raster=raster_of(fit)), asked, scene)
+    return _Drive(scene, cloud if config.given_classes else without_classes(cloud), recorded, fit, vacated, weather)
+
+
+_drive_again = functools.lru_cache(maxsize=1)(_drive_of)
+"""The same for the next trajectory of a run; ``run`` forgets it."""
+
+
+def _view_maker(
+    config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel, scratch: Path
+) -> ViewMaker:
+    """What makes the views of one trajectory; ``scratch``: a folder for what is large."""
+    drive = _drive_again(config, given) if given.script is None else _drive_of(config, given)
+    camera = path.views[0].camera
+    width, height = model.image_size(camera.width, camera.height, config.width_px)
+    model.check_clip(min(len(path), model.config.window), height, width)
+    fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
+    rules = ConditionRules(width, height, *fine, published=model.points_alone)
+    rules = rules if given.script is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
+    render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
+    near = near_sweeps(drive.scene, drive.cloud, path) if config.condition == FREEVS else None
+    sources = ConditionSources(
+        drive.cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
+    )
+    return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages(scratch)))
+
+
+def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
+    """Number of finished windows and the latents of the last one."""
+    files = sorted(state.glob("[0-9]*.safetensors"))
+    if not files:
+        return 0, {}
+    return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
+
+
+def _sheet_row(condition: Condition, sample: GeneratedClip, i: int) -> np.ndarray:
+    """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
+    cells = [
+        to_bytes(condition.color[i]), to_bytes(sample.rgb[i]), depth_colors(sample.depth[i, 0].numpy()),
+        class_colors(sample.semantics[i].numpy()), gray(sample.confidence[i, 0].numpy()),
+    ]  # fmt: skip
+    return np.concatenate(cells, 1)

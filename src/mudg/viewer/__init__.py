@@ -1,0 +1,1 @@
+"""Pages of results: reports, galleries, the viewer, its server."""

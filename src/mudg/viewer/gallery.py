@@ -1,0 +1,260 @@
+"""``mudg report``: one page over many finished runs. A run that cannot be read is listed with its reason; the others go on."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+from PIL import Image, UnidentifiedImageError
+
+from mudg.base import html, log, store
+from mudg.base.errors import InputError, UsageError
+from mudg.base.records import understood
+from mudg.base.run_folder import ResultFile
+from mudg.scoring.tables import TERMINAL_METRICS, number_text
+from mudg.viewer.report import viewer_address
+
+# gallery --------------------------------------------------------------------------------------------------------------
+#
+# The gallery of ``mudg report``: one page over many finished runs, with a card per run and one table of all scores.
+
+
+THUMBNAIL_PX: Final = 320, 120
+"""Width of the pictures on cards, and where there are more than `MANY` runs."""
+MANY: Final = 200
+
+
+@dataclass(frozen=True)
+class GalleryEntry:
+    """A finished folder on the page.
+
+    Args:
+        folder: of the run. kind: what made it: run, score or bench. scores: its metrics.json, None of a benchmark.
+        facts: words below its name. picture: of a rendered view, if there is one. pages: title -> file.
+    """
+
+    folder: Path
+    kind: str
+    scores: Mapping[str, Any] | None
+    facts: str
+    picture: Path | None
+    pages: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A folder that is not on the page, and why."""
+
+    folder: Path
+    reason: str
+
+
+def read_shown(folder: Path) -> GalleryEntry:
+    """What a folder of ``mudg run``, ``mudg score`` or ``mudg bench`` holds.
+
+    Raises:
+        InputError: it is none of them, unfinished, or damaged.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=str(folder))
+    with understood("a finished run", str(folder)):
+        entry = _bench(folder) if (folder / "bench.json").is_file() else _run_or_scores(folder)
+        page([replace(entry, picture=None)], [], folder / "page.html")  # what cannot be shown ends here
+    return entry
+
+
+def _run_or_scores(folder: Path) -> GalleryEntry:
+    state = store.read_json(folder / store.RUN_STATE) if (folder / store.RUN_STATE).is_file() else {}
+    asked = state.get("asked", {}) if isinstance(state, dict) else {}
+    if isinstance(asked, dict) and asked.get("verb") == "run":
+        return _run(folder, state)
+    if isinstance(state, dict) and state.get("verb") == "score":
+        _require_finished(folder, state)
+        return GalleryEntry(folder, "score", _scores(folder / "metrics.json"), "", None, {})
+    raise InputError("not a folder of mudg run, score or bench", where=str(folder))
+
+
+def _require_finished(folder: Path, state: Mapping[str, Any]) -> None:
+    if state.get("state") != "complete":
+        raise InputError(
+            "the run is not finished", where=str(folder), got=str(state.get("state"))[:40], remedy="repeat its command: it resumes"
+        )  # fmt: skip
+
+
+def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
+    _require_finished(folder, state)
+    scores = _scores(folder / "score" / "metrics.json")
+    seconds = sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())
+    known = {"report": folder / "report.html", "viewer": folder / viewer_address(folder), "scores": folder / "score" / "metrics.md"}
+    pages = {title: path for title, path in known.items() if path.is_file()}
+    minutes, rest = divmod(round(seconds), 60)
+    return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)
+
+
+def _bench(folder: Path) -> GalleryEntry:
+    found = store.read_json(folder / "bench.json")
+    name = str(found.get("bench", "")) if isinstance(found, dict) else ""
+    pages = {title: folder / file for title, file in (("page", "page.html"), ("tables", "bench.md")) if (folder / file).is_file()}
+    return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, pages)
+
+
+def _scores(path: Path) -> Mapping[str, Any]:
+    found = store.read_json(path)
+    if not isinstance(found, dict) or not {"scene", "methods", "metrics", "by_distance"} <= found.keys():
+        raise InputError("the scores are malformed", where=str(path), expected="what mudg score wrote", remedy="score the run again")
+    return found
+
+
+def _picture(folder: Path) -> Path | None:
+    """A rendered view of the last method: the middle of its first trajectory."""
+    for views in sorted((folder / "render").glob("*"), reverse=True):
+        for trajectory in sorted(views.glob("*_recorded")) or sorted(views.glob("*")):
+            pictures = sorted((trajectory / "rgb").glob("*.png"))
+            if pictures:
+                return pictures[len(pictures) // 2]
+    return None
+
+
+# ---- the page ----
+
+
+def page(shown: Sequence[GalleryEntry], unread: Sequence[Unread], out: Path) -> str:
+    """The whole page. Links are relative to ``out``, the file that it becomes; pictures lie inside.
+
+    Args:
+        shown: in this order. unread: listed with their reasons.
+    """
+    names = _names([one.folder for one in shown])
+    width = THUMBNAIL_PX[len(shown) > MANY]
+    cards = [_card(one, name, out, width) for one, name in zip(shown, names, strict=True)]
+    metrics = _metrics(shown)
+    rows = [row for one, name in zip(shown, names, strict=True) for row in _rows(one, name, metrics)]
+    return html.render(
+        "gallery.html.j2", title="Runs", kicker="mudg report", lead=f"{len(shown)} finished runs, {len(rows)} rows of scores.", cards=cards,
+        metrics=[{"title": m["title"], "unit": m["unit"], "better": m["better"]} for m in metrics], rows=rows,
+        places=list(dict.fromkeys(row["place"] for row in rows)),
+        unread=[{"name": str(one.folder), "reason": one.reason} for one in unread],
+    )  # fmt: skip
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """The last parts of the folders' paths, as many as tell them apart."""
+    for count in range(1, 8):
+        names = ["/".join(Path(os.path.abspath(folder)).parts[-count:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name} ({number + 1})" for number, name in enumerate(names)]
+
+
+def _card(one: GalleryEntry, name: str, out: Path, width: int) -> dict[str, Any]:
+    scene = {} if one.scores is None else one.scores["scene"]
+    facts = [
+        one.kind, scene.get("id", ""), scene.get("dataset", ""),
+        f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else "", one.facts,
+    ]  # fmt: skip
+    links = [{"title": title, "href": quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))} for title, path in one.pages.items()]
+    return {"name": name, "facts": [str(fact) for fact in facts if fact], "links": links, "picture": _thumbnail(one.picture, width)}
+
+
+def _thumbnail(picture: Path | None, width: int) -> str:
+    """A small picture as a data address; empty where there is none that can be read."""
+    if picture is None:
+        return ""
+    try:
+        image = Image.open(io.BytesIO(store.read_bytes(picture))).convert("RGB")
+    except (InputError, UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
+        return ""
+    image.thumbnail((width, width))
+    content = io.BytesIO()
+    image.save(content, "JPEG", quality=80)
+    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode('ascii')}"
+
+
+def _metrics(shown: Sequence[GalleryEntry]) -> list[Mapping[str, Any]]:
+    """The main metrics that any of the scores have, each once."""
+    found = {m["name"]: m for one in shown if one.scores is not None for m in one.scores["metrics"]}
+    return [found[name] for name in TERMINAL_METRICS if name in found]
+
+
+def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    if one.scores is None:
+        return []
+    titles = {method["name"]: method["title"] for method in one.scores["methods"]}
+    rows = []
+    for entry in sorted(one.scores["by_distance"], key=lambda e: float(e["distance_m"])):
+        distance = float(entry["distance_m"])
+        values = [entry["values"].get(metric["name"]) for metric in metrics]
+        if not any(isinstance(value, float) for value in values):
+            continue
+        rows.append({
+            "run": name, "scene": str(one.scores["scene"]["id"]), "method": str(titles.get(entry["method"], entry["method"])),
+            "place": "recorded path" if distance == 0 else f"{distance:g} m aside",
+            "cells": [{"text": number_text(m["name"], v) if isinstance(v, float) else "", "value": v if isinstance(v, float) else ""}
+                      for m, v in zip(metrics, values, strict=True)],
+        })  # fmt: skip
+    return rows
+
+
+# gallery --------------------------------------------------------------------------------------------------------------
+
+
+def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+    """Write the page of finished runs, scores and benchmarks.
+
+    Args:
+        runs: folders of ``mudg run``, ``mudg score`` or ``mudg bench``; of any other folder, those directly in it.
+        out: the file to write. overwrite: replace it if it exists.
+
+    Returns:
+        ``page``: the file; ``shown``: how many folders are on it; ``text``.
+
+    Raises:
+        UsageError: another page is there, or the output is no HTML file. InputError: nothing can be shown.
+    """
+    out = Path(out)
+    if out.suffix != ".html":
+        raise UsageError("the page is an HTML file", where="--out", expected="a name that ends in .html", got=str(out))
+    shown: list[GalleryEntry] = []
+    unread: list[Unread] = []
+    for folder in _folders(runs):
+        try:
+            shown.append(read_shown(folder))
+        except InputError as error:
+            log.warn(f"{folder}: {error.what}")
+            unread.append(Unread(folder, error.what if not error.got else f"{error.what}: {error.got}"))
+        except PermissionError as error:
+            log.warn(f"{folder}: access was refused")
+            unread.append(Unread(folder, f"access was refused: {error.filename}"))
+    if not shown:
+        raise InputError(
+            "no finished run to show", where=", ".join(str(one.folder) for one in unread[:4]),
+            got="; ".join(dict.fromkeys(one.reason for one in unread[:4])), expected="folders of mudg run, score or bench",
+        )  # fmt: skip
+    content = page(shown, unread, out.resolve()).encode()
+    with ResultFile.open(out, "report", {}, {"page": hashlib.sha256(content).hexdigest()}, overwrite=overwrite) as file:
+        if file.complete:
+            file.reused()
+        else:
+            store.atomic_write(file.staged(), content)
+            file.finish({"runs": len(shown)})
+    left = f", {len(unread)} not shown" if unread else ""
+    text = f"page: {out.resolve()} ({len(shown)} runs{left}, {len(content) / 1e6:.1f} MB)"
+    return {"page": out, "shown": len(shown), "text": text}
+
+
+def _folders(runs: Sequence[Path]) -> list[Path]:
+    """The folders asked for, each once; a folder that is no run stands for the folders in it."""
+    found: list[Path] = []
+    for given in map(Path, runs):
+        own = any((given / name).is_file() for name in (store.RUN_STATE, "bench.json"))
+        below = [] if own or not given.is_dir() else sorted(given.iterdir())
+        inside = [one for one in below if one.is_dir() and not one.name.startswith((".", "_"))]
+        found += [one for one in (inside or [given]) if one.resolve() not in {known.resolve() for known in found}]
+    return found

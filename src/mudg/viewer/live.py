@@ -1,0 +1,425 @@
+"""Exact frames and videos for the viewer page: what a browser asks for, checked, and drawn by the rasterizer."""
+
+from __future__ import annotations
+
+import functools
+import io
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import Field
+
+from mudg.base import store
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.plain_yaml import LARGEST_BYTES
+from mudg.base.records import Number, StrictRecord
+from mudg.base.types import Camera, FusedCloud, Observation, Scene, View
+from mudg.core.edit import Motion
+from mudg.core.pictures import class_colors, depth_colors, to_bytes
+from mudg.diffusion.clips.inputs import InWeather
+from mudg.editing.apply import left_behind, street_left
+from mudg.editing.carried import FACT, EditedDrive, carry_out
+from mudg.editing.model import motion_of
+from mudg.editing.plan import EditPlan
+from mudg.editing.runs import find_run
+from mudg.editing.script import EditScript, parse_edits, read_edits
+from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.formats.exporters.video import mp4_bytes
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.viewer.page import begin_of, key_rows
+from mudg.viewer.report import FAR_M, NEAR_M
+
+# edits ----------------------------------------------------------------------------------------------------------------
+#
+# Edits made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a script.
+
+
+MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
+"""First line of a saved script; a file without it belongs to somebody else."""
+NAME: Final = "edits.yaml"
+SEALED: Final = (store.MANIFEST, "run.json", "model.json")
+"""A folder that holds one of these is the result of a command: nothing is added to it."""
+KEPT: Final = 2
+"""Scripts whose edited scenes stay in memory: that of the picture, and the one before."""
+STREETS: Final = 3
+"""Streets that objects have left, kept in memory for each fit."""
+
+
+@dataclass(frozen=True, slots=True)
+class EditFiles:
+    """The script that a page begins with, where edits are saved (None: beside the run), and whether a foreign file may be replaced."""
+
+    script: Path | None = None
+    out: Path | None = None
+    overwrite: bool = False
+
+
+class EditRequest(StrictRecord):
+    """A script, as ``assets/viewer/edits.js`` writes it; ``save`` also writes the file."""
+
+    script: Annotated[str, Field(max_length=LARGEST_BYTES)]
+    save: bool = False
+
+
+@dataclass(slots=True)
+class EditDesk:
+    """Carries out scripts on what a page shows.
+
+    Args:
+        models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page begins with.
+        place: file to save to. overwrite: even if it is not one of ours.
+        run: the finished run that is shown, whose objects a page may insert; empty where it is a fit alone.
+    """
+
+    models: Sequence[SceneModel]
+    scene: Scene
+    cloud: FusedCloud | None
+    place: Path
+    begin: EditScript | None = None
+    overwrite: bool = False
+    run: str = ""
+    _planned: dict[str, EditedDrive] = field(default_factory=dict)
+    _made: dict[str, list[SceneModel]] = field(default_factory=dict)
+    _streets: dict[tuple[object, ...], SceneModel] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _making: threading.Lock = field(default_factory=threading.Lock)
+
+    def entries(self) -> list[dict[str, Any]]:
+        """The edits that the page begins with, as [{verb: settings}] with absolute paths."""
+        if self.begin is None:
+            return []
+        return [
+            {e.verb: e.settings.model_dump(mode="json", by_alias=True, exclude_unset=True)}
+            for e in self._absolute(self.begin).edits
+        ]
+
+    def _absolute(self, script: EditScript) -> EditScript:
+        """The script with absolute paths: it may be saved elsewhere."""
+        return parse_edits(script.text(), "edits", Path()) if script.files() else script
+
+    def edited(self, text: str) -> list[SceneModel]:
+        """The fits with a script carried out; as they are where it is empty.
+
+        Raises:
+            InputError: it cannot be carried out; the message names line, verb and field.
+        """
+        if not text.strip():
+            return list(self.models)
+        drive = self._carried(text)
+        with self._making:
+            if text not in self._made:
+                made = [drive.model(model, street_of=self._street) for model in self.models]
+                self._made = {**_last(self._made, KEPT - 1), text: made}
+            return self._made[text]
+
+    def _street(self, model: SceneModel, plan: EditPlan) -> SceneModel:
+        """What ``street_left`` makes, remembered: closing a street takes seconds, and an object is moved many times."""
+        key = (id(model), *left_behind(model, plan))
+        if key not in self._streets:
+            self._streets = {**_last(self._streets, STREETS * len(self.models) - 1), key: street_left(model, plan)}
+        return self._streets[key]
+
+    def _carried(self, text: str) -> EditedDrive:
+        """A script carried out on all but the fits; quick."""
+        script = parse_edits(text, NAME)  # others need not wait while a long text is read
+        with self._lock:
+            if text not in self._planned:
+                known = (
+                    {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
+                )
+                foreign = sorted(set(script.files()) - known - {self.run})
+                if foreign:
+                    raise InputError("a page may name no files but those of --edits", where=NAME, got=foreign[0],
+                        remedy="write them into the script by hand")  # fmt: skip
+                drive = carry_out(script, self.models[0], self.scene, self.cloud)
+                self._planned = {**_last(self._planned, KEPT - 1), text: drive}
+            return self._planned[text]
+
+    def answer(self, asked: EditRequest) -> tuple[bytes, str]:
+        """What a script does, as JSON: paths of changed objects, who is gone, notes, the file that was saved."""
+        said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
+        if asked.script.strip():
+            drive = self._checked(asked.script)
+            said |= {
+                "paths": self._paths(drive), "removed": list(drive.plan.removed), "inserted": list(drive.plan.inserted),
+                "notes": [note["text"] for note in drive.notes] + _unseen(drive),
+            }  # fmt: skip
+        if asked.save:
+            said["saved"] = str(self.save(asked.script))
+        return store.json_text(said, indent=None).encode(), "application/json"
+
+    def _checked(self, text: str) -> EditedDrive:
+        """A script that can be carried out on the fits, too. Streets and sides are closed later, when a frame is asked for."""
+        drive = self._carried(text)
+        if not (drive.plan.closed or drive.plan.sides):
+            self.edited(text)
+            return drive
+        for model in self.models:
+            drive.model(model, street_of=functools.partial(street_left, close=False))
+        return drive
+
+    def _paths(self, drive: EditedDrive) -> dict[str, Any]:
+        """Keys of changed objects: ``rows`` as in ``key_rows``, ``source`` the moments of the recording that they show."""
+        begin = begin_of(self.scene)
+        nodes = {node.name: node for node in self.models[0].nodes if isinstance(node, RigidNode)}
+
+        def record(motion: Motion) -> dict[str, Any]:
+            return {
+                "rows": key_rows(motion.times_s - begin, motion.poses).tolist(),
+                "source": (motion.source_s - begin).tolist(),
+            }
+
+        changed = {
+            name: drive.plan.changed(name, motion_of(nodes[name])) for name in drive.plan.changes if name in nodes
+        }
+        standing = {name: drive.plan.after.actors[name].motion for name in drive.plan.touched() if name not in changed}
+        return {name: record(motion) for name, motion in {**changed, **standing}.items()}
+
+    def save(self, text: str) -> Path:
+        """Write the script.
+
+        Raises:
+            InputError: there is nothing to save, or the file belongs to somebody else.
+        """
+        if not text.strip():
+            raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
+        if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
+            raise InputError("the file was not written by mudg view", where=str(self.place),
+                remedy="start mudg view with another --edits-out, or add --overwrite")  # fmt: skip
+        store.atomic_write(self.place, (MARK + text).encode())
+        return self.place
+
+
+def _last(kept: dict[Any, Any], count: int) -> dict[Any, Any]:
+    """The last entries of a dictionary."""
+    return dict(list(kept.items())[len(kept) - min(count, len(kept)) :])
+
+
+def _unseen(drive: EditedDrive) -> list[str]:
+    """What the page, or its exact frames, do not show of a script."""
+    found = []
+    if drive.plan.closed and drive.plan.views:
+        found.append("exact frames close the street that objects leave (close_street), the first one after some seconds; the page's own "
+                     "picture shows it as it was fitted")  # fmt: skip
+    if drive.plan.moves_ego:
+        found.append("the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle")
+    return found
+
+
+def desk_for(
+    models: Sequence[SceneModel], scene: Scene, cloud: FusedCloud | None, run: Path, files: EditFiles
+) -> EditDesk:
+    """What carries out the edits of a page.
+
+    Raises:
+        InputError: the script cannot be carried out. UsageError: edits would be saved into a finished result.
+    """
+    begin = None if files.script is None else read_edits(files.script)
+    own = str(Path(run).resolve()) if find_run(run).whole else ""
+    desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite, own)
+    if begin is not None:
+        carry_out(begin, models[0], scene, cloud)
+    return desk
+
+
+def place_for(run: Path, given: Path | None) -> Path:
+    """Where edits of a run are saved: the given file, else beside the run, else in the current folder.
+
+    Raises:
+        UsageError: the given file lies in the result of a command.
+    """
+    if given is not None:
+        if _sealed(given) or given.is_dir():
+            raise UsageError("edits are not saved into the result of a command", where="--edits-out", got=str(given),
+                expected="a file outside of runs")  # fmt: skip
+        return given
+    beside = Path(run).resolve().parent / NAME
+    return Path(NAME) if _sealed(beside) else beside
+
+
+def _sealed(path: Path) -> bool:
+    return any((folder / name).is_file() for folder in path.resolve().parents for name in SEALED)
+
+
+# frames ---------------------------------------------------------------------------------------------------------------
+
+
+LAYERS: Final = ("color", "depth", "class")
+VIDEO_CRF: Final = 18
+"""x264's quality of videos; lower is better."""
+MOST_FRAMES: Final = 3000
+MOST_PIXELS: Final = 2**31
+"""Of all frames of a video together: it is held in memory until it is sent, in about a tenth as many bytes."""
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+class Wanted(StrictRecord):
+    """What all frames of a question have in common. ``edits``: a script."""
+
+    scene: Annotated[int, Field(ge=0)]
+    layer: Literal["color", "depth", "class"]
+    hidden: Annotated[list[str], Field(max_length=100_000)]
+    edits: Annotated[str, Field(max_length=1_000_000)] = ""
+    camera: str
+    width: Annotated[int, Field(ge=1, le=8192)]
+    height: Annotated[int, Field(ge=1, le=8192)]
+    fx: Annotated[Number, Field(gt=0)]
+    fy: Annotated[Number, Field(gt=0)]
+    cx: Number
+    cy: Number
+
+
+class Moment(StrictRecord):
+    """When and from where. ``axes``: the camera's right, down and ahead in the world."""
+
+    time_s: Number
+    eye: Vector
+    axes: Annotated[list[Vector], Field(min_length=3, max_length=3)]
+
+
+class FrameRequest(Wanted, Moment):
+    """One frame, as ``assets/viewer/exact.js`` asks for it."""
+
+
+class VideoRequest(Wanted):
+    """A video, as ``assets/viewer/exact.js`` asks for it: a frame per moment."""
+
+    fps: Annotated[Number, Field(ge=1, le=60)]
+    moments: Annotated[list[Moment], Field(min_length=1, max_length=MOST_FRAMES)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The scenes with a script carried out, on the device, and the weather of those that were asked for in colour, by their number."""
+
+    edits: str
+    models: list[SceneModel]
+    weather: dict[int, InWeather]
+
+
+def _drawer_of(model: SceneModel) -> Drawer:
+    raster = raster_of(model)
+    return lambda view: render_view(model, view, raster)
+
+
+class FrameSource:
+    """Draws frames of one or two fitted scenes, one at a time.
+
+    Args:
+        edited: the scenes with a script carried out; "" = as they are. scene: the log; its recorded views tell the light of the drive,
+            where a script asks for other weather or light.
+        widest: pixels of the widest frame.
+    """
+
+    def __init__(self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device) -> None:
+        self._edited = edited
+        self._scene = scene
+        self._device = device
+        self._shown: _Shown | None = None
+        self._widest = widest
+        self._lock = threading.Lock()
+        self._filming = threading.Lock()
+
+    def png(self, asked: FrameRequest) -> bytes:
+        """A frame as PNG bytes.
+
+        Raises:
+            InputError: a camera that is none, or edits that cannot be carried out.
+        """
+        content = io.BytesIO()
+        picture = self._picture(asked.layer, self._drawer(asked), View(self._camera(asked), _pose(asked), float(asked.time_s)))
+        Image.fromarray(picture).save(content, "PNG", compress_level=1)
+        return content.getvalue()
+
+    def film(self, asked: VideoRequest, send: Callable[[bytes], None]) -> None:
+        """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes, then the MP4
+        file. Frames that are asked for meanwhile are drawn in between.
+
+        Raises:
+            InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of ``send``; nothing is left.
+        """
+        camera, count = self._camera(asked), len(asked.moments)
+        if camera.width * camera.height * count > MOST_PIXELS:
+            raise InputError(
+                "the video is too large",
+                where="video",
+                expected=f"at most {MOST_PIXELS:,} pixels in all frames together",
+                got=f"{count} frames of {camera.width} x {camera.height}",
+                remedy="start mudg view with a smaller --width-px, or use mudg render",
+            )
+        if not self._filming.acquire(blocking=False):
+            raise ResourceError("another video is being made", remedy="wait for it, or cancel it where it was asked for")
+        try:
+            content = mp4_bytes(self._pictures(asked, camera, send), asked.fps, crf=VIDEO_CRF)
+        finally:
+            self._filming.release()
+        send(_line(bytes=len(content)))
+        send(content)
+
+    def _pictures(self, asked: VideoRequest, camera: Camera, send: Callable[[bytes], None]) -> Iterator[NDArray[np.uint8]]:
+        draw = self._drawer(asked)
+        for number, moment in enumerate(asked.moments, 1):
+            yield self._picture(asked.layer, draw, View(camera, _pose(moment), float(moment.time_s)))
+            send(_line(frame=number, frames=len(asked.moments)))
+
+    def _drawer(self, asked: Wanted) -> Drawer:
+        """What draws the scene that is asked for, without what is hidden, in the weather and light of the script."""
+        with self._lock:
+            if self._shown is None or self._shown.edits != asked.edits:
+                self._shown = _Shown(asked.edits, [model.to(self._device) for model in self._edited(asked.edits)], {})
+            index = min(asked.scene, len(self._shown.models) - 1)
+            model = self._shown.models[index]
+            gone = [name for name in asked.hidden if name in model.node_names()]
+            draw = _drawer_of(model.without_nodes(gone) if gone else model)
+            conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
+            if conditions is None or asked.layer != "color":
+                return draw
+            if index not in self._shown.weather:
+                self._shown.weather[index] = weather_of(_drawer_of(model), conditions, self._scene)
+            return in_weather(draw, self._shown.weather[index])
+
+    def _picture(self, layer: str, draw: Drawer, view: View) -> NDArray[np.uint8]:
+        with self._lock:
+            return _colors(draw(view), layer)
+
+    def _camera(self, asked: Wanted) -> Camera:
+        """The camera, not wider than allowed."""
+        camera = Camera(asked.camera or "free", asked.width, asked.height, asked.fx, asked.fy, asked.cx, asked.cy)
+        if asked.width > self._widest:
+            camera = camera.resized(self._widest, max(1, round(asked.height * self._widest / asked.width)))
+        return camera
+
+
+def _pose(asked: Moment) -> NDArray[np.float64]:
+    """World from camera, f64[4, 4]."""
+    pose = np.eye(4)
+    pose[:3, :3] = orthonormal(np.array(asked.axes, np.float64).T)
+    pose[:3, 3] = asked.eye
+    return pose
+
+
+def _line(**values: int) -> bytes:
+    return store.json_text(values, indent=None).encode() + b"\n"
+
+
+def orthonormal(axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest rotation: axes come with the rounding of a browser's sums."""
+    left, _, right = np.linalg.svd(axes)
+    return left @ right
+
+
+def _colors(seen: Observation, layer: str) -> NDArray[np.uint8]:
+    if layer == "depth" and seen.depth is not None:
+        return depth_colors(seen.depth[0].numpy(), NEAR_M, FAR_M)
+    if layer == "class" and seen.semantics is not None:
+        return class_colors(seen.semantics.numpy())
+    return to_bytes(seen.rgb)

@@ -1,0 +1,677 @@
+"""The report: one self-contained page of a finished run. Needs no network and works by double click.
+
+Each trajectory becomes one H.264 video that holds all panels (columns: truth and methods; rows: colour, depth, classes,
+colour error), so that the panels can never run apart; the page cuts them out of it.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mudg import native
+from mudg.base import html, log, memory, store
+from mudg.base.errors import InputError
+from mudg.base.processes import computed_ahead
+from mudg.base.records import understood
+from mudg.base.types import Observation
+from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
+from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
+from mudg.scene.observations import ObservationSet, list_observation_sets, read_observations
+from mudg.scoring.tables import (
+    FLOOR,
+    NOT_COMPUTED,
+    SET_METRICS,
+    WEIGHT_FLAGS,
+    best_of,
+    distance_title,
+    floors_by_distance,
+    number_text,
+    title_of,
+    values_by_distance,
+)
+
+# command lines for the report of a run: what to do with it next, and its steps one by one -----------------------------
+
+
+PLAIN: Final = "fit/street_gaussians"
+GUIDED: Final = "fit/mudg_s"
+STEPS: Final = (
+    "scene", "annotate", "fuse", PLAIN, "adapt", "synthesize", GUIDED, "render/street_gaussians", "render/mudg_s", "score",
+)  # fmt: skip
+"""Folders of the chain, in the order in which they are made."""
+INPUTS: Final = {
+    "fused": ("--fused", "fuse"), "fitted": ("--fitted", PLAIN), "start": ("--start-from", PLAIN),
+    "observations": ("--observations", "synthesize"),
+}  # fmt: skip
+"""Inputs that a step's record names: their flag, and the folder of the chain."""
+VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthesize", "mudg_s": "render/mudg_s"}
+
+
+class CommandBlock(NamedTuple):
+    """Command lines that belong together, with a sentence on what they do."""
+
+    title: str
+    lines: tuple[str, ...]
+
+
+def next_commands(out: Path, source: str) -> list[CommandBlock]:
+    """What a run can be used for. Each block works by itself, in the folder from which the run was started."""
+    run = str(out)
+    scene, movable = scene_of(out, source), _first_object(out)
+    edit = f"- remove: {{ids: [{json.dumps(movable)}]}}" if movable else "- weather: {fog: {visibility_m: 60}}"
+    blocks = [
+        ("Fly through the scene in a browser; the second line compares both fits", [["view", run], ["view", run, run]]),
+        ("One page to send to others", [["page", run, "--out", f"{run}.html"]]),
+        ("Change the drive, and look at it", [
+            [f"printf '%s\\n' {shlex.quote(edit)} > edits.yaml"], ["edit", run, "edits.yaml", "--out", f"{run}_edited"],
+            ["view", run, "--edits", "edits.yaml"],
+        ]),
+        ("Pictures, depth and classes of another path", [
+            ["render", scene, "--model", f"{run}/{GUIDED}", "--shifts-m", "1.5", "--out", f"{run}_views"],
+        ]),
+        ("Files for other programs (docs: export)", [
+            ["export", "ply", run, "--out", f"{run}.ply"], ["export", "usdz", run, "--out", f"{run}.usdz"],
+            *([["asset", "export", run, movable, "--out", f"{run}_object.safetensors"]] if movable else []),
+        ]),
+        ("The same on your own log", [["run", "LOG", "--out", "runs/mine"]]),
+    ]  # fmt: skip
+    return [CommandBlock(title, tuple(_line(words) for words in lines)) for title, lines in blocks]
+
+
+def step_commands(out: Path, source: str) -> list[str]:
+    """The steps of a run, each as a command with the settings that it had: as it stands it verifies the result and reuses it."""
+    found = []
+    for folder in STEPS:
+        try:
+            inputs: Sequence[str] = list(store.read_json(out / folder / store.RUN_STATE)["inputs"])
+            verb = str(store.read_json(out / folder / store.RUN_STATE)["verb"])
+        except (InputError, KeyError, TypeError):
+            continue
+        words = [verb, source if folder == "scene" else scene_of(out, source, labelled=folder != "annotate")]
+        for name in inputs:
+            if name in INPUTS:
+                words += [INPUTS[name][0], f"{out}/{INPUTS[name][1]}"]
+        if verb == "render":
+            words += ["--model", f"{out}/fit/{Path(folder).name}"]
+        if verb == "score":
+            words += ["--views", *(f"{name}={out}/{place}" for name, place in VIEWS.items() if name in inputs)]
+        found.append(_line([*words, "--config", f"{out}/{folder}/run.yaml", "--out", f"{out}/{folder}"]))
+    return found
+
+
+def scene_of(out: Path, source: str, labelled: bool = True) -> str:
+    """The scene that the steps of a run read: labelled by it, made by it, or given to it."""
+    names = ("annotate", "scene") if labelled else ("scene",)
+    return next((f"{out}/{name}" for name in names if (out / name / "scene.json").is_file()), source)
+
+
+def _line(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"mudg {shlex.join(words)}"
+
+
+def _first_object(out: Path) -> str:
+    """Id of an object that an edit script can name; empty if the fit has none."""
+    try:
+        nodes = store.read_json(out / GUIDED / "model.json")["nodes"]
+        return next((str(node["name"]) for node in nodes if "label" in node), "")
+    except (InputError, KeyError, TypeError):
+        return ""
+
+
+# page -----------------------------------------------------------------------------------------------------------------
+#
+# The report page: what ``templates/report.html.j2`` shows, worked out from plain values. No torch, no files.
+
+
+GROUPS: Final = (
+    ("Colour", ("psnr", "ssim", "perceptual")),
+    ("Motion", ("psnr_movers", "flicker")),
+    ("Depth", ("abs_rel", "rmse_m", "delta1")),
+    ("Classes", ("miou", "accuracy")),
+    ("At LiDAR points", ("lidar_abs_rel", "lidar_rmse_m", "lidar_delta1", "lidar_psnr", "agreement")),
+    ("Vehicles and lanes", ("agent_iou", "lane_iou", "lane_correlation", "lane_psnr", "nta_iou", "ntl_iou")),
+    ("Steadiness", ("warp_error", "temporal_flickering", "subject_consistency", "clip_f")),
+)
+OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
+"""Groups that are left out, and distances of them, where no method has a number."""
+ABSENT: Final = ("lpips", "fid", "kid", "fvd")
+"""Metrics whose columns are shown although they were not computed; the others are named below the tables."""
+CHARTED: Final = ("psnr", "abs_rel", "miou")
+NEAR_M: Final = 2.0
+FAR_M: Final = 80.0
+WITH: Final = "mudg_s"
+WITHOUT: Final = "street_gaussians"
+FPS: Final = 10
+PANEL_ROWS: Final = (("rgb", "Colour"), ("depth", "Depth"), ("semantics", "Classes"), ("error", "Colour error"))
+"""Rows of a video, and their titles."""
+
+
+@dataclass(frozen=True)
+class TrajectoryVideo:
+    """The video of one trajectory.
+
+    Args:
+        name, camera, shift_m: as in the scores. width, height: of one panel, pixels. frames: number of pictures.
+        panels: column name -> rows it has. video, poster: data URIs (video may be empty: no encoder).
+    """
+
+    name: str
+    camera: str
+    shift_m: float | None
+    width: int
+    height: int
+    frames: int
+    panels: Mapping[str, Sequence[str]]
+    video: str
+    poster: str
+
+    @property
+    def place(self) -> str:
+        """Where the trajectory runs, for people."""
+        return shift_title(self.shift_m, self.name)
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """How the diffusion model was adapted: the content of ``adapt.json``, and pictures (title, data URI)."""
+
+    record: Mapping[str, Any]
+    pictures: Sequence[tuple[str, str]]
+
+
+def page(
+    scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str, videos: Sequence[TrajectoryVideo],
+    columns: Sequence[str], adaptation: Adaptation | None = None, viewer: str = "", out: Path = Path(),
+) -> str:  # fmt: skip
+    """The text of the page.
+
+    Args:
+        scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
+        columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if there was one.
+        viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for commands.
+    """
+    scene = scores["scene"]
+    heading, lead = headline(scores)
+    source = str(ledger.get("asked", {}).get("source", "LOG"))
+    return html.render(
+        "report.html.j2", title=f"{scene['id']}: mudg report", kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
+        heading=heading, lead=lead, scene=scene, viewer=viewer, facts=_facts(scores, ledger), rules=scores["rules"],
+        methods=scores["methods"], settings=settings, provenance=_provenance(scores, ledger),
+        adaptation=None if adaptation is None else adaptation.record,
+        adaptation_pictures=() if adaptation is None else adaptation.pictures,
+        next_commands=next_commands(out, source), step_commands=step_commands(out, source),
+        **_player_values(scores, videos, columns), **_score_values(scores), **_time_values(ledger),
+    )  # fmt: skip
+
+
+# ---- text at the top ----
+
+
+def headline(scores: Mapping[str, Any]) -> tuple[str, str]:
+    """Headline and one paragraph that say what the numbers say, also when diffusion did not help."""
+    values = values_by_distance(scores)
+    shifted = sorted({d for m, d in values if d > 0 and m == WITH and isinstance(values[m, d].get("psnr"), float)})
+    recorded = [values.get((method, 0.0), {}).get("psnr") for method in (WITH, WITHOUT)]
+    held_out = ""
+    if all(isinstance(value, float) for value in recorded):
+        held_out = f"held-out frames score {recorded[0]:.1f} dB with diffusion and {recorded[1]:.1f} dB without."
+    if not shifted:
+        text = "There is no ground truth off the recorded path: views there are shown below, not scored."
+        return (
+            f"{scores['scene']['id']}: views off the recorded path",
+            f"{text} On the path, {held_out}" if held_out else text,
+        )
+    far = shifted[-1]
+    with_, without = values[WITH, far], values.get((WITHOUT, far), {})
+    if not isinstance(without.get("psnr"), float):
+        return f"{far:g} m off the recorded path", ""
+    gain = with_["psnr"] - without["psnr"]
+    verdict = f"diffusion {'adds' if gain > 0 else 'costs'} {abs(gain):.1f} dB"
+    if abs(gain) < 0.05:
+        verdict = "diffusion makes no difference to colour"
+    sentences = [
+        f"{distance_title(scores, far)} of the recorded path, colour reaches {with_['psnr']:.1f} dB against exact ground truth "
+        f"({without['psnr']:.1f} dB without diffusion)."
+    ]
+    for metric, text in (("abs_rel", "relative depth error"), ("miou", "class overlap (mIoU)")):
+        if isinstance(with_.get(metric), float) and isinstance(without.get(metric), float):
+            sentences.append(f"The {text} is {with_[metric]:.3f}, against {without[metric]:.3f} without.")
+    if held_out:
+        sentences.append(f"On the recorded path itself, {held_out}")
+    return f"{far:g} m off the recorded path, {verdict}", " ".join(sentences)
+
+
+def _facts(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tuple[str, str]]:
+    scene = scores["scene"]
+    cameras = len(scene["cameras"])
+    return [
+        (f"{scene['frames']}", "recorded frames"),
+        (f"{cameras}", "camera" if cameras == 1 else "cameras"),
+        (f"{scene['tracks']}", "tracked objects"),
+        (f"{sum(t['views'] for t in scores['trajectories'])}", "views rendered per method"),
+        (_duration(sum(step["seconds"] for step in ledger.get("steps", {}).values())), "from log to this page"),
+    ]
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+# ---- player ----
+
+
+def shift_title(shift_m: float | None, name: str) -> str:
+    """Where a trajectory runs, for people."""
+    if shift_m is None:
+        return name
+    return "recorded path" if shift_m == 0 else f"{abs(shift_m):g} m {'left' if shift_m > 0 else 'right'}"
+
+
+def _player_values(
+    scores: Mapping[str, Any], videos: Sequence[TrajectoryVideo], columns: Sequence[str]
+) -> dict[str, Any]:
+    """What ``player.html.j2`` shows; ``player`` goes to ``player.js``."""
+    exact = scores["truth"] == "exact"
+    ordered = sorted(videos, key=lambda v: (v.camera, -(v.shift_m if v.shift_m is not None else -1e9)))
+    first = max((v for v in videos if v.shift_m), key=lambda v: v.shift_m or 0.0, default=next(iter(videos), None))
+    steps = np.geomspace(NEAR_M, FAR_M, 8).astype(np.float32)[None]
+    return {
+        "exact": exact,
+        "videos": [{"label": f"{v.camera}, {v.place}", "source": v.video, "poster": v.poster} for v in videos],
+        "cameras": list(dict.fromkeys(v.camera for v in videos)),
+        "shift_choices": [
+            {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first} for v in ordered
+        ],
+        "depth_scale": {
+            "near": f"{NEAR_M:g}", "far": f"{FAR_M:g}",
+            "stops": ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0]),
+        },
+        "class_legend": html.class_legend(),
+        "player": {
+            "fps": FPS, "columns": list(columns), "rows": [{"name": name, "title": title} for name, title in PANEL_ROWS],
+            "titles": {c: title_of(c) if exact or c != "truth" else "Recorded path" for c in columns},
+            "trajectories": [
+                {"index": i, "name": v.name, "camera": v.camera, "title": v.place, "width": v.width, "height": v.height,
+                 "frames": v.frames, "panels": {c: list(p) for c, p in v.panels.items()}}
+                for i, v in enumerate(videos) if v.video
+            ],
+        },
+    }  # fmt: skip
+
+
+# ---- numbers ----
+
+
+def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``scores.html.j2`` shows."""
+    values = values_by_distance(scores)
+    distances = sorted({d for m, d in values if any(isinstance(v, float) for v in values[m, d].values())})
+    metrics = {m["name"]: m for m in scores["metrics"]}
+    absent = [m for m in metrics.values() if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in scores["results"])]
+    main = [n for title, names in GROUPS if title not in OPTIONAL for n in names]
+    sets = [name for name, entry in SET_METRICS.items() if entry in scores]
+    distances = [d for d in distances if _shown(values, [*main, *sets], d)]
+    groups = []
+    for title, names in GROUPS:
+        there = distances
+        if title in OPTIONAL:
+            names = [n for n in names if any(isinstance(of.get(n), float) for of in values.values())]
+            there = [d for d in sorted({d for _, d in values}) if _shown(values, names, d)]
+        if there:
+            groups.append(_score_group(scores, title, [metrics[n] for n in names if n in metrics], there))
+    made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
+    if made_of_sets:
+        groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
+    shown = [m for m in absent if m["name"] in ABSENT]
+    if shown:
+        cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in shown]
+        rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
+        groups.append({"title": "Perceptual", "distances": [], "metrics": shown, "rows": rows})
+    numeric = [
+        m for m in metrics.values() if any(isinstance(r["values"].get(m["name"]), float) for r in scores["results"])
+    ]
+    return {
+        "score_groups": groups if distances or any(group["title"] in OPTIONAL for group in groups) else [],
+        "not_computed": ", ".join(f"{m['title']} ({_remedy_of(m)})" for m in absent),
+        "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
+        "result_metrics": numeric,
+        "results": [
+            [r["trajectory"], title_of(r["method"]), r["views"], *(number_text(m["name"], r["values"].get(m["name"])) for m in numeric)]
+            for t in scores["trajectories"] for r in scores["results"] if r["trajectory"] == t["name"]
+        ],
+    }  # fmt: skip
+
+
+def _shown(values: Mapping[tuple[str, float], Mapping[str, Any]], names: Sequence[str], distance: float) -> bool:
+    """Whether some method has a number in one of these metrics at a distance."""
+    return any(isinstance(of.get(name), float) for (_, d), of in values.items() if d == distance for name in names)
+
+
+def _score_group(
+    scores: Mapping[str, Any], title: str, metrics: Sequence[Mapping[str, Any]], distances: Sequence[float]
+) -> dict[str, Any]:
+    """One table: the metrics of a group at every distance."""
+    values, methods = values_by_distance(scores), [m["name"] for m in scores["methods"]]
+
+    def cells(method: str) -> Iterator[dict[str, str]]:
+        for distance in distances:
+            for number, metric in enumerate(metrics):
+                across = {m: values.get((m, distance), {}).get(metric["name"]) for m in methods}
+                classes = ["edge"] * (number == 0) + ["best"] * (
+                    method in best_of(metric["better"], across, metric["name"])
+                )
+                classes += ["absent"] * isinstance(across[method], str)
+                yield {"text": number_text(metric["name"], across[method]), "classes": " ".join(classes)}
+
+    rows = [{"method": m["name"], "title": m["title"], "cells": list(cells(m["name"]))} for m in scores["methods"]]
+    return {
+        "title": title,
+        "distances": [distance_title(scores, d) for d in distances],
+        "metrics": metrics,
+        "rows": rows,
+    }
+
+
+def _remedy_of(metric: Mapping[str, Any]) -> str:
+    flag = WEIGHT_FLAGS.get(metric["name"])
+    return f"{metric['needs'][-1]}" + (f": mudg score {flag} FILE" if flag else "")
+
+
+def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
+    """The group with a last row: what the truth itself scores."""
+    floors = floors_by_distance(scores)
+    cells = [{"text": number_text(m["name"], floors.get(d, {}).get(m["name"])), "classes": ""} for d in distances for m in group["metrics"]]
+    return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
+
+
+def chart_points(scores: Mapping[str, Any], metric: str) -> dict[str, list[tuple[float, float]]]:
+    """Method -> (shift in metres, mean value over cameras), left of the road first."""
+    shifts = {t["name"]: t["shift_m"] for t in scores["trajectories"] if t["shift_m"] is not None}
+    points: dict[str, list[tuple[float, float]]] = {}
+    for method in scores["methods"]:
+        found: dict[float, list[float]] = {}
+        for r in scores["results"]:
+            value = r["values"].get(metric)
+            if r["method"] == method["name"] and r["trajectory"] in shifts and isinstance(value, float):
+                found.setdefault(float(shifts[r["trajectory"]]), []).append(value)
+        if found:
+            points[method["name"]] = [(s, sum(v) / len(v)) for s, v in sorted(found.items(), reverse=True)]
+    return points
+
+
+def axis_ticks(low: float, high: float) -> list[float]:
+    """Three to six round numbers that enclose all values, at even distances."""
+    span = (high - low) or abs(high) or 1.0
+    power = 10.0 ** math.floor(math.log10(span / 3))
+    step = next(power * k for k in (1, 2, 2.5, 5, 10) if span / (power * k) <= 4)
+    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    return [i * step for i in range(first, max(last, first + 2) + 1)]
+
+
+def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Values of the macro ``chart``: one line per method over the lateral shift; None with fewer than two shifts."""
+    points = chart_points(scores, metric["name"])
+    shifts = sorted({s for p in points.values() for s, _ in p})
+    if len(shifts) < 2:
+        return None
+    numbers = [v for p in points.values() for _, v in p]
+    ticks = axis_ticks(min(numbers), max(numbers))
+    left, right, top, bottom = 40.0, 330.0, 8.0, 150.0
+
+    def x(shift: float) -> float:  # left of the road is left on the chart
+        return round(left + (shifts[-1] - shift) / (shifts[-1] - shifts[0]) * (right - left), 1)
+
+    def y(value: float) -> float:
+        return round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
+
+    better = f"{metric['better']} is better"
+    return {
+        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""), "better": better,
+        "label": f"{metric['title']} over the lateral shift, {better}", "left": left, "right": right, "bottom": bottom,
+        "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
+        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts], "to_left": shifts[-1] > 0, "to_right": shifts[0] < 0,
+        "lines": [{"method": m, "points": [(x(s), y(v)) for s, v in line]} for m, line in points.items()],
+    }  # fmt: skip
+
+
+# ---- times, settings ----
+
+
+def _time_values(ledger: Mapping[str, Any]) -> dict[str, Any]:
+    seconds = {name: step["seconds"] for name, step in ledger.get("steps", {}).items()}
+    total, longest = sum(seconds.values()) or 1.0, max(seconds.values(), default=1.0) or 1.0
+    size = lambda step, name: memory.in_words(step[name]) if step.get(name) else ""  # noqa: E731
+    steps = [
+        {"name": name, "seconds": step["seconds"], "processor_s": step.get("processor_s"), "memory": size(step, "peak_bytes"),
+         "written": size(step, "written_bytes"), "share": step["seconds"] / total, "of_longest": step["seconds"] / longest}
+        for name, step in ledger.get("steps", {}).items()
+    ]  # fmt: skip
+    return {"steps": steps, "total_time": _duration(total)}
+
+
+def _provenance(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What was run, on what and by what: rows that have a value."""
+    environment, asked, scene = ledger.get("environment", {}), ledger.get("asked", {}), scores["scene"]
+    sizes = ", ".join(f"{name} {w} x {h}" for name, (w, h) in scene["cameras"].items())
+    seeds = {str(asked[verb]["seed"]) for verb in ("synthesize", "fit") if "seed" in asked.get(verb, {})}
+    machine = [environment.get(key, "") for key in ("system", "machine", "cpu_count")]
+    rows = [
+        ("Input", str(asked.get("source", ""))),
+        ("Scene", f"{scene['id']}: {scene['frames']} frames, {scene['held_out']} held out; cameras {sizes}"),
+        ("Seed", ", ".join(sorted(seeds))),
+        ("Diffusion model", str(asked.get("synthesize", {}).get("model", "")).replace("embedded", "shipped with mudg")),
+        ("Licence of the data", scene["licence"]),
+        ("Ground truth", "exact at any view" if scores["truth"] == "exact" else "recorded held-out frames only"),
+        ("Program", f"mudg {environment.get('mudg', '')}, Python {environment.get('python', '')}"),
+        ("Machine", f"{machine[0]} {machine[1]}, {machine[2]} processors"),
+        ("Packages", ", ".join(f"{name} {version}" for name, version in environment.get("packages", {}).items())),
+        ("Hashes (SHA-256)", ", ".join(f"{name} {digest[:16]}" for name, digest in ledger.get("digests", {}).items())),
+    ]
+    return [(name, value) for name, value in rows if value]
+
+
+# panels of a video: several methods' views of one moment side by side, one row per modality ---------------------------
+
+
+BLANK: Final = 24
+"""Grey value of a panel that a method does not produce."""
+
+
+def panel_size(camera_width: int, camera_height: int, widest: int) -> tuple[int, int]:
+    """Width and height of a panel, both even: at most ``widest``, in the camera's proportions."""
+    width = min(widest, camera_width) // 2 * 2
+    return width, max(2, round(camera_height * width / camera_width) // 2 * 2)
+
+
+def panel_grid(
+    views: Mapping[str, Observation | None], rows: Sequence[str], size: tuple[int, int], truth: Observation | None
+) -> NDArray[np.uint8]:
+    """One picture u8[rows * height, columns * width, 3] of one moment; what a method lacks stays grey.
+
+    Args:
+        views: column -> what it shows. rows: of ``rgb``, ``depth``, ``semantics``, ``error``.
+        size: width and height of a panel, pixels. truth: what colour errors are measured against; its own column has none.
+    """
+    width, height = size
+    grid = np.full((height * len(rows), width * len(views), 3), BLANK, np.uint8)
+    true_rgb = None if truth is None else resize_rgb(truth.rgb, height, width).clamp(0, 1)
+    for x, seen in enumerate(views.values()):
+        if seen is None:
+            continue
+        against = None if seen is truth else true_rgb
+        for y, row in enumerate(rows):
+            picture = _panel(seen, row, size, against)
+            if picture is not None:
+                grid[y * height : (y + 1) * height, x * width : (x + 1) * width] = picture
+    return grid
+
+
+def _panel(seen: Observation, row: str, size: tuple[int, int], true_rgb: Tensor | None) -> NDArray[np.uint8] | None:
+    width, height = size
+    if row == "depth":
+        return (
+            None
+            if seen.depth is None
+            else depth_colors(resize_nearest(seen.depth, height, width)[0].numpy(), NEAR_M, FAR_M)
+        )
+    if row == "semantics":
+        return None if seen.semantics is None else class_colors(resize_nearest(seen.semantics, height, width).numpy())
+    rgb = resize_rgb(seen.rgb, height, width)
+    if row == "error":
+        return None if true_rgb is None else error_image(rgb, true_rgb)
+    return to_bytes(rgb)
+
+
+# run report -----------------------------------------------------------------------------------------------------------
+
+
+PANEL_WIDTH: Final = 320
+BUDGET_BYTES: Final = 9 * 2**19
+"""For all videos together, before base64; with the posters the page stays under 8 MB."""
+VIEWER: Final = "viewer.html"
+VIEWER_FOLDER: Final = "viewer_page/index.html"
+SAME_TIME_S: Final = 1e-4
+ROWS: Final = tuple(name for name, _ in PANEL_ROWS)
+ENCODING: Final = Encoding(FPS, first_crf=33, last_crf=45, preset="veryfast")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The observation sets of one trajectory, by column name, and which view of each stands at each frame.
+
+    ``has_truth``: the column "truth" shows this very trajectory, not the recorded path at the same moments.
+    """
+
+    sets: Mapping[str, ObservationSet]
+    indices: Mapping[str, Sequence[int]]
+    frames: int
+    has_truth: bool
+
+
+def film(out: Path) -> list[TrajectoryVideo]:
+    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see ``stages.run``).
+
+    Raises:
+        InputError: the run is not scored yet, or a folder of views is damaged.
+    """
+    out = Path(out)
+    with understood("a scored run", str(out)):
+        scores = store.read_json(out / "score" / "metrics.json")
+        folders = _folders(out, scores)
+        trajectories = [t for t in scores["trajectories"] if any(t["name"] in found for found in folders.values())]
+    playable = bool(video_encoders())
+    if not playable:
+        log.warn("PyAV has no H.264 encoder here: the report shows one picture per trajectory instead of a video")
+    budget = BUDGET_BYTES // max(1, len(trajectories)) if playable else 0
+    videos = computed_ahead(lambda n: _video(trajectories[n], folders, budget), len(trajectories), native.default_threads())
+    return list(log.progress(videos, len(trajectories), "report"))
+
+
+def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
+    """The cheap half: scores, times and settings around the videos, and a link to the viewer page if there is one."""
+    out = Path(out)
+    settings = out / "run.yaml"
+    text = store.read_text(settings) if settings.is_file() else ""
+    with understood("a scored run", str(out)):
+        scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
+        content = page(scores, ledger, text, videos, list(_folders(out, scores)), _adaptation(out / "adapt"), viewer_address(out), out)
+    store.write_text(out / "report.html", content)
+    return out / "report.html"
+
+
+def viewer_address(out: Path) -> str:
+    """The viewer page of a run, relative to its folder: one file, or the first page of a folder; empty if there is none."""
+    return next((name for name in (VIEWER, VIEWER_FOLDER) if (out / name).is_file()), "")
+
+
+def _adaptation(folder: Path) -> Adaptation | None:
+    """The adaptation in a finished folder of the verb adapt; None if there is no such folder."""
+    if not (folder / store.MANIFEST).is_file():
+        return None
+    names = (("Before", "before.png"), ("After", "after.png"))
+    pictures = [(title, _data_uri("image/png", store.read_bytes(folder / name))) for title, name in names]
+    return Adaptation(store.read_json(folder / "adapt.json"), pictures)
+
+
+def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
+    """Column name -> trajectory -> folder, in the order of the page."""
+    places = {"truth": out / "score" / "truth"}
+    for method in scores["methods"]:
+        name = method["name"]
+        candidates = (out / "render" / name, out / "score" / name, out / "synthesize")
+        places[name] = next(path for path in candidates if path.is_dir() or path.name == "synthesize")
+    found = {name: list_observation_sets(path) for name, path in places.items()}
+    return {name: sets for name, sets in found.items() if sets}
+
+
+# ---- one trajectory as one video ----
+
+
+def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]], budget: int) -> TrajectoryVideo:
+    """All panels of a trajectory as one video of at most ``budget`` bytes; 0 = only the picture of its middle frame."""
+    columns = _columns(trajectory, folders)
+    size = panel_size(int(trajectory["width"]), int(trajectory["height"]), PANEL_WIDTH)
+    order = list(folders)
+    video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
+    poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
+    return TrajectoryVideo(
+        name=trajectory["name"], camera=str(trajectory["camera"]), shift_m=trajectory["shift_m"], width=size[0], height=size[1],
+        frames=columns.frames, panels={column: _rows(columns, column) for column in columns.sets},
+        video=_data_uri("video/mp4", video) if video else "", poster=_data_uri("image/jpeg", poster),
+    )  # fmt: skip
+
+
+def _columns(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
+    """Truth and baseline have just the scored views; of the methods' views the scorer's indices pick the same.
+
+    Where a trajectory has no truth (a shifted view of a recorded log), its column shows the recorded path at the same moments.
+    """
+    name, frames, picked = trajectory["name"], int(trajectory["views"]), trajectory["indices"]
+    sets = {column: read_observations(found[name]) for column, found in folders.items() if name in found}
+    indices: dict[str, Sequence[int]] = {c: picked[c] if c in picked else range(frames) for c in sets}
+    has_truth = "truth" in sets
+    recorded_folder = folders.get("truth", {}).get(f"{trajectory['camera']}_recorded")
+    if not has_truth and recorded_folder is not None:
+        recorded = read_observations(recorded_folder)
+        column = next(iter(sets))
+        wanted = np.array([sets[column].views[i].time_s for i in indices[column]])
+        apart = np.abs(np.array([view.time_s for view in recorded.views])[None] - wanted[:, None])
+        if apart.min(1).max() < SAME_TIME_S:
+            sets = {"truth": recorded, **sets}
+            indices["truth"] = apart.argmin(1).tolist()
+    return Columns(sets, indices, frames, has_truth)
+
+
+def _rows(columns: Columns, column: str) -> tuple[str, ...]:
+    """The rows that a column has, as its first view says."""
+    first = columns.sets[column][columns.indices[column][0]]
+    there = {
+        "rgb": True, "depth": first.depth is not None, "semantics": first.semantics is not None,
+        "error": columns.has_truth and column != "truth",
+    }  # fmt: skip
+    return tuple(row for row in ROWS if there[row])
+
+
+def _frames(
+    columns: Columns, order: Sequence[str], size: tuple[int, int], first: int = 0
+) -> Iterator[NDArray[np.uint8]]:
+    """One picture per frame: columns in page order, rows of ``ROWS``; what a method does not produce stays grey."""
+    for frame in range(first, columns.frames):
+        views = {c: columns.sets[c][columns.indices[c][frame]] if c in columns.sets else None for c in order}
+        yield panel_grid(views, ROWS, size, views["truth"] if columns.has_truth else None)
+
+
+def _data_uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
