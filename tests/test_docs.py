@@ -35,8 +35,8 @@ FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--rdzv
                  **dict.fromkeys(("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle",
                                   "--shutdown-timeout"), "torchrun"),
                  **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch")}  # fmt: skip
-FOLDERS = ("benchmarks fleet steps viewer scoring exporting editing diffusion baselines gaussians labels formats city scene networks core native "
-           "base bench docs tests tools build_backend src").split()
+FOLDERS = ("benchmarks fleet steps viewer scoring exporting editing diffusion baselines gaussians labels formats city scene networks "
+           "core native base bench docs tests tools build_backend src").split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 
 

@@ -13,12 +13,12 @@ from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core import metrics as flicker
 from mudg.core.metrics import Pair
+from mudg.diffusion import synthesize
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing import render
 from mudg.networks import featnets
 from mudg.networks.codec import CodecConfig, PatchCodec
 from mudg.networks.featnets import CodecFeatures, PerceptualDistance
-from mudg.steps import synthesis as synthesize
 
 
 def pair_of(height: int, width: int, *, masked: bool) -> Pair:

@@ -13,7 +13,7 @@ from mudg.base import palette, scratch
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
 from mudg.core import trajectory
-from mudg.diffusion import files
+from mudg.diffusion import files, synthesize
 from mudg.diffusion.clips import condition, stacked
 from mudg.diffusion.extended import extended
 from mudg.diffusion.model import MDM, MDMConfig
@@ -25,7 +25,6 @@ from mudg.networks.codec import CodecConfig
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps import synthesis as synthesize
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize
@@ -133,7 +132,7 @@ def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world
     monkeypatch.setattr(condition, "_prepare_source", lambda *given: prepared.append(given[1].view.time_s) or prepare(*given))
     both = made(world, tmp_path / "both", shifts_m=(2.0, 1.0))
     assert len(prepared) == len(set(prepared)) > 1
-    assert synthesize._drive_again.cache_info().currsize == 0
+    assert synthesize._recorded_again.cache_info().currsize == 0
     for one, other in zip(*(frames_of(out / "front_shift+1.0") for out in (both, usual)), strict=True):
         assert torch.equal(one.rgb, other.rgb)
         assert torch.equal(one.depth.nan_to_num(), other.depth.nan_to_num())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
@@ -53,12 +54,12 @@ class Synthesize(Output):
         return ("fused",)
 
     def checked(self) -> Self:
-        from mudg.diffusion import views as loading
-        from mudg.steps import synthesis as synthesize
+        from mudg.diffusion.views import check_config
+        from mudg.editing.generated import shows_weather
 
         renders = self.fitted is not None
-        weather = self.edits is not None and synthesize.shows_weather(self.settings, script_of(self.edits)[0], renders)
-        return replace(self, settings=loading.check_config(self.settings, renders, weather=weather))
+        weather = self.edits is not None and shows_weather(self.settings, script_of(self.edits)[0], renders)
+        return replace(self, settings=check_config(self.settings, renders, weather=weather))
 
     def reads(self) -> dict[str, Path | str | None]:
         from mudg.diffusion.files import folder_of
@@ -76,13 +77,21 @@ class Synthesize(Output):
         return {name: value for name, value in super().key_settings().items() if name not in ("offload", "compiled")}
 
     def prepare(self, inputs: dict[str, str]) -> Any:
-        from mudg.steps import synthesis as synthesize
+        from mudg.diffusion.synthesize import JobInputs
+        from mudg.editing.generated import edited_drive, edited_scene
+        from mudg.gaussians.storage import model_of_scene
+        from mudg.scene.read import read_scene
 
-        script = None if self.edits is None else script_of(self.edits)[0]
-        given = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script)
-        return given, synthesize.read_drive(self.settings, given)
+        scene = read_scene(self.scene)
+        if self.fitted is not None:
+            model_of_scene(self.fitted, scene)  # refuses the fit of another scene
+        given = JobInputs(self.scene, cast("Path", self.fused), self.fitted)
+        if self.edits is None:
+            return given, scene
+        script = script_of(self.edits)[0]
+        return replace(given, edited=functools.partial(edited_drive, script)), edited_scene(script, self.settings, given, scene)
 
     def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.steps import synthesis as synthesize
+        from mudg.diffusion.synthesize import write_views
 
-        return synthesize.write_views(self.settings, *prepared, work.path)
+        return write_views(self.settings, *prepared, work.path)

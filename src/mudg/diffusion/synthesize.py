@@ -14,7 +14,7 @@ import functools
 import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,6 @@ from mudg.core.raster.cpu import release_memory
 from mudg.diffusion import views as loading
 from mudg.diffusion.clips.condition import ConditionRules, VacatedAt
 from mudg.diffusion.clips.inputs import ConditionSources, InWeather, NearSweeps
-from mudg.diffusion.published.model import is_published
 from mudg.diffusion.requests import GeneratedClip
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.diffusion.views import (
@@ -48,12 +47,9 @@ from mudg.diffusion.views import (
     recorded_images,
     windows,
 )
-from mudg.editing import weathered as editing_weather
-from mudg.editing.recorded import DriveOfEdits, drive_of_edits, photos_of_edited, vacated_at
-from mudg.editing.script import EditScript
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.rendering import raster_of, render_planes, render_view
-from mudg.gaussians.storage import load_model, model_of_scene
+from mudg.gaussians.rendering import render_planes
+from mudg.gaussians.storage import load_model
 from mudg.networks.codec import Modality
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused
@@ -70,22 +66,38 @@ PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
 WINDOW_FRAMES = 8
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of a size."""
+
+    scene: Scene
+    cloud: FusedCloud
+    recorded: list[Photo]
+    fit: SceneModel | None = None
+    vacated: VacatedAt | None = None
+    weather: InWeather | None = None
+    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, slots=True)
 class JobInputs:
-    """What every trajectory is made from: folders of the scene, its fused clouds and its fit, and the edit script."""
+    """What every trajectory is made from: folders of the scene, its fused clouds and its fit.
+
+    Args:
+        edited: reads an edited drive in place of the recorded one; processes are sent it.
+    """
 
     scene: Path
     fused: Path
     fitted: Path | None = None
-    script: EditScript | None = None
+    edited: Callable[[SynthesizeConfig, JobInputs], Drive] | None = None
 
 
-def read_drive(config: SynthesizeConfig, given: JobInputs) -> Scene:
-    """The scene whose cameras are moved, as the edit script leaves it: what cannot be done is told here, before anything is written."""
-    loaded = read_scene(given.scene)
-    if given.fitted is not None:
-        model_of_scene(given.fitted, loaded)  # refuses the fit of another scene
-    return loaded if given.script is None else _edited(config, given, given.script, loaded).scene
+def recorded_drive(config: SynthesizeConfig, given: JobInputs) -> Drive:
+    """The drive as it was recorded."""
+    scene = read_scene(given.scene)
+    fit = None if given.fitted is None else load_model(given.fitted)
+    return Drive(scene, read_fused(given.fused), recorded_images(scene, config), fit)
 
 
 def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: Path) -> dict[str, Any]:
@@ -111,7 +123,7 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: 
     try:
         frames = _run_jobs([(config, given, out, path, model) for path in paths], names, processes)
     finally:
-        _drive_again.cache_clear()
+        _recorded_again.cache_clear()
     seconds = time.monotonic() - started
     log.info(f"synthesize: {frames} views in {seconds:.1f} s, {seconds / max(frames, 1):.2f} s each")
     return {"trajectories": names, "views": frames}
@@ -133,24 +145,6 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
         log.info(f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
                  f"{memory.in_words(need)}, and {memory.in_words(free)} are free")  # fmt: skip
     return possible
-
-
-def _edited(config: SynthesizeConfig, given: JobInputs, script: EditScript, scene: Scene) -> DriveOfEdits:
-    """The drive that the script makes of scene, clouds and fit."""
-    if config.condition == FREEVS:
-        raise UsageError("this condition is made of recorded sweeps, which show no edits", where="--condition", got=FREEVS,
-            remedy="edit a whole run with `mudg edit` and give its scene")  # fmt: skip
-    told = not shows_weather(config, script, given.fitted is not None)
-    fitted = None if given.fitted is None else load_model(given.fitted)
-    return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told)
-
-
-def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
-    """Whether views are generated in the weather and light of a script: by a published-type model, from points and a reference in that
-    weather, whose distances a fit tells."""
-    asked = editing_weather.conditions_of(script.canonical())
-    wanted = asked is not None and asked.changes_air_ground_or_light and fitted and config.condition == "full"
-    return wanted and is_published(config.model)
 
 
 def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
@@ -238,52 +232,26 @@ def make_trajectory(
     return len(path)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Drive:
-    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of a size."""
-
-    scene: Scene
-    cloud: FusedCloud
-    recorded: list[Photo]
-    fit: SceneModel | None = None
-    vacated: VacatedAt | None = None
-    weather: InWeather | None = None
-    images: dict[tuple[int, int], PreparedImages] = field(default_factory=dict)
-
-
-def _drive_of(config: SynthesizeConfig, given: JobInputs) -> _Drive:
-    scene, cloud = read_scene(given.scene), read_fused(given.fused)
-    fit = None if given.fitted is None else load_model(given.fitted)
-    recorded, vacated, weather = recorded_images(scene, config), None, None
-    if given.script is not None:
-        drive = drive_of_edits(given.script, scene, cloud, fit)
-        scene, cloud, fit, recorded = drive.scene, drive.cloud, drive.model, photos_of_edited(recorded, drive.plan)
-        vacated = vacated_at(drive.plan)
-        asked = editing_weather.conditions_of(given.script.canonical())
-        if asked is not None and fit is not None and shows_weather(config, given.script, True):
-            weather = editing_weather.weather_of(functools.partial(render_view, fit, raster=raster_of(fit)), asked, scene)
-    return _Drive(scene, cloud if config.given_classes else without_classes(cloud), recorded, fit, vacated, weather)
-
-
-_drive_again = functools.lru_cache(maxsize=1)(_drive_of)
-"""The same for the next trajectory of a run; ``run`` forgets it."""
+_recorded_again = functools.lru_cache(maxsize=1)(recorded_drive)
+"""The same for the next trajectory of a run, which forgets it at its end."""
 
 
 def _view_maker(
     config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel, scratch: Path
 ) -> ViewMaker:
     """What makes the views of one trajectory; ``scratch``: a folder for what is large."""
-    drive = _drive_again(config, given) if given.script is None else _drive_of(config, given)
+    drive = _recorded_again(config, given) if given.edited is None else given.edited(config, given)
+    cloud = drive.cloud if config.given_classes else without_classes(drive.cloud)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
     model.check_clip(min(len(path), model.config.window), height, width)
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
-    rules = rules if given.script is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
+    rules = rules if given.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
     render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
-    near = near_sweeps(drive.scene, drive.cloud, path) if config.condition == FREEVS else None
+    near = near_sweeps(drive.scene, cloud, path) if config.condition == FREEVS else None
     sources = ConditionSources(
-        drive.cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
+        cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
     )
     return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages(scratch)))
 
