@@ -33,8 +33,7 @@ from mudg.city.config import CityConfig
 from mudg.city.light import CityLight, city_light
 from mudg.city.world import CityTruth, CityWorld
 from mudg.core import weather
-from mudg.core.weather import air as fog
-from mudg.core.weather import ground
+from mudg.core.weather import air, ground
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
     BufferRules,
@@ -161,8 +160,8 @@ def score_fog(
     lines.append(
         f"sRGB, exact depth {psnr(SRGB.encode(foggy(case, generic, visibility_m, guess, 0.0)), truth.rgb, solid):.1f}"
     )
-    share = np.exp(-fog.extinction(visibility_m) * np.where(truth.sky, 0, exact.depth).astype(np.float64))
-    shown = fog.veiled(case.truth.rgb, share, SRGB.encode(guess.airlight[None])[0])
+    share = np.exp(-air.extinction(visibility_m) * np.where(truth.sky, 0, exact.depth).astype(np.float64))
+    shown = air.veiled(case.truth.rgb, share, SRGB.encode(guess.airlight[None])[0])
     lines.append(f"display values and camera z {psnr(shown, truth.rgb, solid):.1f}")
     if fitted is not None:
         rgb, depth = fitted
@@ -195,17 +194,17 @@ def score_light(case: Case, name: str) -> Result:
     exact = replace(case.exact(own), new_sunlit=world.surfaces(case.view).sunlit)
     for label, gbuffer in (("exact surfaces", exact), ("height map", estimated)):
         clear = np.exp(
-            -fog.extinction(case.light.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
+            -air.extinction(case.light.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
         )
-        gbuffer = replace(gbuffer, color=fog.unveiled(gbuffer.color, clear, around.airlight))
+        gbuffer = replace(gbuffer, color=air.unveiled(gbuffer.color, clear, around.airlight))
         points = None
         if name == "night":
             points = relight.night_lights(gbuffer, case.view, goal, LightSettings(time="night", headlights=False))
         lit, _ = relight.relit(gbuffer, case.view, around, goal, points)
         hazy = np.exp(
-            -fog.extinction(target.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
+            -air.extinction(target.visibility_m) * np.where(truth.sky, 0, euclidean_range(case.view, gbuffer.depth))
         )
-        shown = there.encode(fog.veiled(lit, np.where(truth.sky, 1, hazy), goal.airlight))
+        shown = there.encode(air.veiled(lit, np.where(truth.sky, 1, hazy), goal.airlight))
         lines.append(f"{label} {psnr(shown, truth.rgb, solid):.1f}")
     return Result(lines, shown, truth.rgb)
 

@@ -31,7 +31,7 @@ from write_pandaset import write_pandaset
 
 from mudg.base import log
 from mudg.base.types import Scene, Track
-from mudg.city import sensors as rig
+from mudg.city import sensors
 from mudg.city.logs import write_city
 
 DISTORTION = (-0.356, 0.171, -0.0003, -0.0002, -0.05)
@@ -51,7 +51,7 @@ def write_waymo(truth: Scene, folder: Path) -> None:
     """Format 1 of Waymo: one TFRecord file."""
     import write_waymo
 
-    made = write_waymo.log_of(truth, truth.tracks, beams=rig.lidar_elevations(roundtrip.SMALL), columns=240)
+    made = write_waymo.log_of(truth, truth.tracks, beams=sensors.lidar_elevations(roundtrip.SMALL), columns=240)
     write_waymo.write_tfrecord(made, folder / f"segment-{made.name}_with_camera_labels.tfrecord")
 
 

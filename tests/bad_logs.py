@@ -34,7 +34,7 @@ from PIL import Image
 
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
-from mudg.city import sensors as rig
+from mudg.city import sensors
 from mudg.formats.importers import IMPORTERS
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene.read import read_scene
@@ -115,7 +115,7 @@ def written(kind: str, folder: Path) -> Files | write_waymo.Log:
 def waymo(folder: Path) -> write_waymo.Log:
     """The city as a Waymo log, without recorded projections, which take most of the time to write."""
     truth = city(folder / "truth")
-    beams = rig.lidar_elevations(roundtrip.SMALL)
+    beams = sensors.lidar_elevations(roundtrip.SMALL)
     log = write_waymo.log_of(truth, read_scene(folder / "truth").tracks, beams=beams, columns=240)
     for frame in log.frames:
         frame["lasers"][0]["projections"] = None

@@ -11,7 +11,7 @@ import torch
 from mudg.base.errors import MudgError, UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
-from mudg.core import metrics as flicker
+from mudg.core import metrics
 from mudg.diffusion import files
 from mudg.diffusion.clips import from_city
 from mudg.diffusion.model import MDM, MDMConfig
@@ -33,13 +33,13 @@ def still_wall(frames=3, height=12, width=16):
     rgb = torch.cat([row[..., t : t + width] for t in range(frames)])
     depth = torch.full((frames, 1, height, width), 10.0)
     ids = torch.full((frames, height, width), 2)
-    return rgb, [flicker.TrueFrame(*one) for one in zip(depth, ids, torch.from_numpy(poses), lens, strict=True)]
+    return rgb, [metrics.TrueFrame(*one) for one in zip(depth, ids, torch.from_numpy(poses), lens, strict=True)]
 
 
 def test_a_moving_camera_alone_is_no_change():
     rgb, frames = still_wall()
     blinking = rgb + torch.tensor([0.0, 0.1, 0.0]).view(3, 1, 1, 1)
-    for made, truth in flicker.changes(blinking, rgb, frames):
+    for made, truth in metrics.changes(blinking, rgb, frames):
         assert truth == pytest.approx(0.0, abs=1e-3)
         assert made == pytest.approx(0.1 * 12 * 15, rel=1e-3)
 
@@ -48,10 +48,10 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
     rgb, frames = still_wall()
     noise = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(1))
     truth, made = rgb + 0.1 * noise, rgb + 0.3 * noise
-    assert flicker.flicker(made, truth, frames) == pytest.approx(3.0, rel=1e-3)
+    assert metrics.flicker(made, truth, frames) == pytest.approx(3.0, rel=1e-3)
     cars = [replace(frame, ids=torch.full_like(frame.ids, 13)) for frame in frames]
-    assert math.isnan(flicker.flicker(made, truth, cars))
-    assert math.isnan(flicker.flicker(made[:1], truth[:1], frames[:1]))
+    assert math.isnan(metrics.flicker(made, truth, cars))
+    assert math.isnan(metrics.flicker(made[:1], truth[:1], frames[:1]))
 
 
 def test_reported_and_development_cities_differ():

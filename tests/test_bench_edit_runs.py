@@ -18,7 +18,7 @@ from mudg.benchmarks import edit_runs
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.edit_runs import RunCase, measured
 from mudg.benchmarks.settings import BenchConfig
-from mudg.core import view_metrics as edit_scores
+from mudg.core import view_metrics
 from mudg.core.table import Table
 from mudg.editing.runs import find_run
 from mudg.editing.script import parse_edits
@@ -107,9 +107,9 @@ def test_fog_keeps_depth_and_loses_edges_with_its_density(case: RunCase) -> None
 
 def test_gradients_agree_under_another_exposure_and_not_with_the_negative() -> None:
     image = torch.from_numpy(np.random.default_rng(0).random((3, 12, 16), np.float32))
-    assert edit_scores.gradient_correlation(0.5 * image + 0.1, image) == pytest.approx(1)
-    assert edit_scores.gradient_correlation(1 - image, image) == pytest.approx(-1)
-    assert edit_scores.gradient_correlation(torch.zeros_like(image), image) is None
+    assert view_metrics.gradient_correlation(0.5 * image + 0.1, image) == pytest.approx(1)
+    assert view_metrics.gradient_correlation(1 - image, image) == pytest.approx(-1)
+    assert view_metrics.gradient_correlation(torch.zeros_like(image), image) is None
 
 
 def test_one_step_of_a_byte_is_no_change_and_two_are() -> None:
@@ -117,13 +117,13 @@ def test_one_step_of_a_byte_is_no_change_and_two_are() -> None:
     other = image.clone()
     other[0, 0, 0] += 1 / 255
     other[2, 1, 1] -= 2 / 255
-    assert edit_scores.changed_pixels(other, image).tolist() == [[False, False], [False, True]]
+    assert view_metrics.changed_pixels(other, image).tolist() == [[False, False], [False, True]]
 
 
 def test_masks_are_counted_in_both_and_in_either() -> None:
     a, b = np.eye(3, dtype=bool), np.zeros((3, 3), bool)
     b[0] = True
-    assert edit_scores.mask_counts(a, b) == (1, 5)
+    assert view_metrics.mask_counts(a, b) == (1, 5)
 
 
 def test_two_drives_give_a_table_a_page_and_resume(

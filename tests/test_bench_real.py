@@ -21,8 +21,7 @@ from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
 from mudg.benchmarks.settings import BenchConfig  # fmt: skip
 from mudg.city.world import CityWorld
-from mudg.core import calibration as color_match
-from mudg.core import lidar as points_seen
+from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
 from mudg.diffusion import files as mdm_files
 from mudg.diffusion.model import MDM
@@ -233,17 +232,17 @@ VIEW = View(CAMERA, np.eye(4), 0.0)
 
 
 def test_a_point_is_seen_if_it_is_not_behind_the_surface():
-    shown = [points_seen.ShownFrame(VIEW, np.full((30, 40), 10.0, np.float32), np.full((30, 40, 3), 77, np.uint8))]
+    shown = [lidar.ShownFrame(VIEW, np.full((30, 40), 10.0, np.float32), np.full((30, 40, 3), 77, np.uint8))]
     xyz = np.array([[0, 0, 9.9], [0, 0, 10.5], [0, 0, 14.0], [100, 0, 5.0], [0, 0, -5.0]], np.float32)
-    points = points_seen.OwnedPoints(xyz, np.full(5, STATIC, np.int32), np.zeros(5, np.uint8), 0.4)
+    points = lidar.OwnedPoints(xyz, np.full(5, STATIC, np.int32), np.zeros(5, np.uint8), 0.4)
     place = lambda points, _: points.xyz  # noqa: E731
-    seen, colors = points_seen.seen_by(place, points, shown, 0.0)
+    seen, colors = lidar.seen_by(place, points, shown, 0.0)
     assert seen.tolist() == [True, True, False, False, False]
     assert colors[0].tolist() == [77, 77, 77] and not colors[2].any()
 
 
 def test_the_mask_takes_the_answer_of_the_nearest_point_nearby():
-    mask = points_seen.spread(np.array([True, False]), np.array([5, 5]), np.array([10, 20]), (11, 100))
+    mask = lidar.spread(np.array([True, False]), np.array([5, 5]), np.array([10, 20]), (11, 100))
     assert mask[5, 8:14].all() and not mask[5, 16:24].any()
     assert not mask[5, 40:].any()  # no point is near
 
@@ -254,13 +253,13 @@ def test_a_color_map_is_found_under_noise_and_outliers():
     given = true + rng.normal(0, 0.04, true.shape)
     wanted = true * [0.8, 1.0, 1.1] + [0.1, 0.0, -0.05] + rng.normal(0, 0.04, true.shape)
     wanted[:2000] = rng.uniform(0.1, 0.9, (2000, 3))
-    found = color_match.color_map(*((np.clip(c, 0, 1) * 255).round().astype(np.uint8) for c in (given, wanted)))
+    found = calibration.color_map(*((np.clip(c, 0, 1) * 255).round().astype(np.uint8) for c in (given, wanted)))
     assert found.gain == pytest.approx((0.8, 1.0, 1.1), abs=0.03)
     assert found.offset == pytest.approx((0.1, 0.0, -0.05), abs=0.02)
     loose = [rng.uniform(90, 110, (1000, 3)).astype(np.uint8) for _ in range(2)]
-    loosely = color_match.color_map(loose[0], (loose[1] * 1.5).astype(np.uint8))
+    loosely = calibration.color_map(loose[0], (loose[1] * 1.5).astype(np.uint8))
     assert loosely.gain == pytest.approx((1.5, 1.5, 1.5), abs=0.03) and loosely.offset == (0, 0, 0)
-    few = color_match.color_map(np.full((10, 3), 50, np.uint8), np.full((10, 3), 90, np.uint8))
+    few = calibration.color_map(np.full((10, 3), 50, np.uint8), np.full((10, 3), 90, np.uint8))
     assert (few.gain, few.pairs) == ((1.0, 1.0, 1.0), 10)
 
 

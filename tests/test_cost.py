@@ -15,7 +15,7 @@ from mudg.base import store
 from mudg.base.memory import in_words
 from mudg.core.raster import probe
 from mudg.gaussians import views as kept
-from mudg.steps import diagnosis as doctor
+from mudg.steps import diagnosis
 from mudg.steps.run import Demo, Run
 from mudg.steps.settings import cost
 from mudg.steps.settings.presets import run_preset
@@ -185,7 +185,7 @@ def test_the_probe_sees_a_machine_of_half_the_speed_of_which_others_take_half(mo
 
 
 def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
-    report = doctor.report_scene(toy_views.write_scene(tmp_path / "scene", lidar=True))
+    report = diagnosis.report_scene(toy_views.write_scene(tmp_path / "scene", lidar=True))
     for name in ("fast", "default", "quality", "paper"):
         assert f"--preset {name}" in report["text"]
         preset = report["presets"]["cpu"][name]
@@ -193,7 +193,7 @@ def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
     for step in report["presets"]["cpu"]["default"]["seconds"]:
         assert f"    {step} " in report["text"]
     (tmp_path / "empty").mkdir()
-    broken = doctor.report_scene(tmp_path / "empty")
+    broken = diagnosis.report_scene(tmp_path / "empty")
     assert broken["presets"] == {}
     assert "--preset" not in broken["text"]
 

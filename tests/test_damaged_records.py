@@ -29,11 +29,9 @@ from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.scoring.detections import read_detections
-from mudg.steps import conversion as convert
-from mudg.steps import pipeline
+from mudg.steps import conversion, pipeline
 from mudg.steps.settings.run import RunConfig
-from mudg.viewer import gallery
-from mudg.viewer import report as run_report
+from mudg.viewer import gallery, report
 
 CASES = 24
 """Of each record, by seeded chance; there may be thousands."""
@@ -126,11 +124,11 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "whole run on a page": (lambda folder: run_of(folder) / "run.json", gallery.read_shown),
     "scores on a page": (lambda folder: run_of(folder) / "score" / "metrics.json", gallery.read_shown),
     "scores in a terminal": (scored, lambda folder: score.summary_table(folder / "score")),
-    "scores in a report": (scored, lambda folder: run_report.write_page(folder, [])),
-    "times in a report": (functools.partial(scored, name="run.json"), lambda folder: run_report.write_page(folder, [])),
+    "scores in a report": (scored, lambda folder: report.write_page(folder, [])),
+    "times in a report": (functools.partial(scored, name="run.json"), lambda folder: report.write_page(folder, [])),
     "checkpoint": (saved_checkpoint, checkpoint.latest),
     "log of a training": (written("log.jsonl", LOSSES), lambda folder: plot_losses(folder / "log.jsonl", folder / "loss.png")),
-    "model folder": (written("model.json", MODEL), convert.own_names),
+    "model folder": (written("model.json", MODEL), conversion.own_names),
     "boxes": (written("boxes.json", BOXES), lambda folder: read_detections(folder / "boxes.json")),
 }
 

@@ -15,7 +15,7 @@ from mudg.benchmarks import chain
 from mudg.benchmarks.chain import Chain, repair_settings
 from mudg.benchmarks.rows import Row
 from mudg.benchmarks.settings import BenchConfig
-from mudg.diffusion import views as loading
+from mudg.diffusion import views
 from mudg.diffusion.clips import condition as clips
 from mudg.diffusion.clips.condition import ConditionRules
 from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
@@ -61,10 +61,10 @@ def test_a_repair_sees_the_render_and_one_photograph_and_nothing_measured(fine):
 
 def test_repairs_need_a_fit_and_only_they_go_with_one():
     with pytest.raises(UsageError, match="renders of a fitted scene"):
-        loading.check_config(SynthesizeConfig(condition="repair"), False)
-    assert loading.check_config(SynthesizeConfig(condition="repair", device="cpu"), True).condition == "repair"
+        views.check_config(SynthesizeConfig(condition="repair"), False)
+    assert views.check_config(SynthesizeConfig(condition="repair", device="cpu"), True).condition == "repair"
     with pytest.raises(UsageError, match="cannot be switched off"):
-        loading.check_config(SynthesizeConfig(condition="points"), True)
+        views.check_config(SynthesizeConfig(condition="points"), True)
 
 
 def test_repaired_views_move_towards_their_places():

@@ -10,11 +10,11 @@ import toy_views
 
 from mudg import app
 from mudg.formats.exporters import video
-from mudg.steps import diagnosis as doctor
+from mudg.steps import diagnosis
 
 
 def test_machine_report_names_what_matters() -> None:
-    report = doctor.report_machine()
+    report = diagnosis.report_machine()
     text = report["text"]
     for word in ("processors", "torch", "native library", "encoders", "weights"):
         assert word in text
@@ -30,7 +30,7 @@ def test_a_missing_native_library_is_a_problem_with_a_remedy(monkeypatch: pytest
 
     monkeypatch.setattr(native, "library", lambda: None)
     monkeypatch.setattr(native, "status", lambda: "native library: not in use (for the test)")
-    report = doctor.report_machine()
+    report = diagnosis.report_machine()
     assert any("C++17 compiler" in problem for problem in report["problems"])
     assert not report["ready"]
 
@@ -38,7 +38,7 @@ def test_a_missing_native_library_is_a_problem_with_a_remedy(monkeypatch: pytest
 def test_a_missing_encoder_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(video, "_H264_ENCODERS", ("no-such-encoder",))
     assert video.video_encoders() == []
-    assert any("H.264" in problem for problem in doctor.report_machine()["problems"])
+    assert any("H.264" in problem for problem in diagnosis.report_machine()["problems"])
 
 
 def test_a_good_scene_is_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ from mudg.core import calibration as edges
 from mudg.formats.importers import IMPORTERS
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene.check import camera_alignment, describe
-from mudg.steps import diagnosis as doctor
+from mudg.steps import diagnosis
 
 TURNS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
@@ -110,14 +110,14 @@ def test_too_little_to_tell_is_said(tmp_path: Path) -> None:
 def test_doctor_tells_of_each_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ToyStreet().write(tmp_path / "scene", labels=False, width=60, height=30)
     doubtful = edges.EdgeAlignment(0.2, (1.0, -0.5), 0.2, 900, "doubtful")
-    from mudg.scene import check as alignment
+    from mudg.scene import check
 
     for found, level, said in (
         (doubtful, "warning", "+1.0 degrees"),
         (replace(doubtful, verdict="right"), None, "agree"),
     ):
-        monkeypatch.setattr(alignment, "camera_alignment", lambda _scene, found=found: {"front": found})
-        report: dict[str, Any] = doctor.report_scene(tmp_path / "scene")
+        monkeypatch.setattr(check, "camera_alignment", lambda _scene, found=found: {"front": found})
+        report: dict[str, Any] = diagnosis.report_scene(tmp_path / "scene")
         assert said in report["text"]
         assert report["alignment"]["front"]["depth_edges"] == 900
         assert any(f["level"] == level and "degrees" in f["words"] for f in report["findings"]) == (level is not None)

@@ -24,8 +24,7 @@ from mudg.benchmarks.edit import city_keys
 from mudg.city import objects as rec
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
-from mudg.core import edit as boxes
-from mudg.core import edit as paths
+from mudg.core import edit
 from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
@@ -63,14 +62,14 @@ def slope(rise: float = 0.1) -> HeightMap:
 
 def test_a_displacement_at_all_times_is_exact() -> None:
     motion, by = straight(), Displacement(3.0, -1.0, 0.5, 0.3)
-    made = paths.moved(motion, by)
+    made = edit.moved(motion, by)
     assert np.array_equal(made.poses, motion.poses @ geometry.yaw_matrix(0.3, (3.0, -1.0, 0.5)))
     assert made.times_s is motion.times_s
 
 
 def test_a_displacement_comes_about_within_its_ramp() -> None:
     motion = straight(speed=0.0)
-    made = paths.moved(motion, Displacement(ahead_m=2.0, from_s=1.0, ramp_s=2.0))
+    made = edit.moved(motion, Displacement(ahead_m=2.0, from_s=1.0, ramp_s=2.0))
     x = lambda t: made.pose_at(t)[0, 3]  # noqa: E731
     assert x(0.99) == pytest.approx(0.0, abs=1e-12)
     assert x(2.0) == pytest.approx(1.0)  # half of the way at half of the time
@@ -80,7 +79,7 @@ def test_a_displacement_comes_about_within_its_ramp() -> None:
 
 @given(st.floats(-4, 4).filter(lambda d: abs(d) > 0.1), st.floats(1.5, 3.0))
 def test_a_lane_change_is_the_quintic_and_its_acceleration_the_known_one(left_m: float, duration_s: float) -> None:
-    made = paths.lane_changed(straight(), left_m, 0.5, duration_s)
+    made = edit.lane_changed(straight(), left_m, 0.5, duration_s)
     s = np.clip((made.times_s - 0.5) / duration_s, 0, 1)
     assert np.allclose(made.poses[:, 1, 3], left_m * (10 * s**3 - 15 * s**4 + 6 * s**5), atol=1e-9)
     assert np.allclose(made.poses[:, 0, 3], 10 * made.times_s, atol=1e-9)
@@ -88,14 +87,14 @@ def test_a_lane_change_is_the_quintic_and_its_acceleration_the_known_one(left_m:
     rate = left_m / duration_s * 30 * s**2 * (1 - s) ** 2
     assert np.allclose(heading, np.arctan2(rate, 10.0), atol=1e-6)  # looks where it goes
     fine = np.linspace(0, 1, 20001)
-    peak = np.abs(np.gradient(np.gradient(left_m * paths.quintic(fine), fine), fine))[5:-5].max() / duration_s**2
-    assert peak == pytest.approx(paths.QUINTIC_PEAK * abs(left_m) / duration_s**2, rel=1e-3)
+    peak = np.abs(np.gradient(np.gradient(left_m * edit.quintic(fine), fine), fine))[5:-5].max() / duration_s**2
+    assert peak == pytest.approx(edit.QUINTIC_PEAK * abs(left_m) / duration_s**2, rel=1e-3)
 
 
 def test_a_lane_change_follows_the_ground() -> None:
-    made = paths.lane_changed(straight(), 3.0, 0.5, 2.0, slope(0.1))
+    made = edit.lane_changed(straight(), 3.0, 0.5, 2.0, slope(0.1))
     assert made.poses[-1, 2, 3] == pytest.approx(0.75 + 0.3, abs=0.01)
-    moved = paths.moved(straight(), Displacement(left_m=3.0), slope(0.1))
+    moved = edit.moved(straight(), Displacement(left_m=3.0), slope(0.1))
     assert np.allclose(moved.poses[:, 2, 3], 1.05, atol=0.01)
     assert np.allclose(moved.poses[:, :3, :3], np.eye(3), atol=1e-6)  # the slope is the same there
     for pose in made.poses:
@@ -104,33 +103,33 @@ def test_a_lane_change_follows_the_ground() -> None:
 
 def test_what_stands_cannot_change_lanes() -> None:
     with pytest.raises(InputError, match="only what drives"):
-        paths.lane_changed(straight(speed=0.0), 3.0, 0.5, 2.0)
+        edit.lane_changed(straight(speed=0.0), 3.0, 0.5, 2.0)
     with pytest.raises(InputError, match="outside the path"):
-        paths.lane_changed(straight(), 3.0, 9.0, 2.0)
+        edit.lane_changed(straight(), 3.0, 9.0, 2.0)
 
 
 def test_braking_takes_the_way_and_the_time_that_physics_says() -> None:
-    made = paths.stopped(straight(speed=8.0), 1.0, 4.0)
+    made = edit.stopped(straight(speed=8.0), 1.0, 4.0)
     x = lambda t: made.pose_at(t)[0, 3]  # noqa: E731
     assert x(1.0) == pytest.approx(8.0)
     assert x(2.0) == pytest.approx(8.0 + 8.0 - 2.0, abs=0.01)
     assert x(3.0) == pytest.approx(8.0 + 8.0, abs=0.01)  # v^2 / 2a = 8 m, 2 s
     assert x(4.0) == x(3.0)
     assert np.all(np.diff(made.source_s) >= -1e-9)
-    short = paths.stopped(straight(speed=8.0), 3.5, 4.0)
+    short = edit.stopped(straight(speed=8.0), 3.5, 4.0)
     assert np.all(short.poses[:, 0, 3] <= straight(speed=8.0).at(short.times_s).poses[:, 0, 3] + 1e-9)
 
 
 @given(st.floats(0.2, 3.0), st.floats(0.0, 3.0))
 def test_speed_scales_the_way(factor: float, from_s: float) -> None:
-    made = paths.sped(straight(), factor, from_s)
+    made = edit.sped(straight(), factor, from_s)
     expected = np.where(made.times_s < from_s, 10 * made.times_s, 10 * (from_s + factor * (made.times_s - from_s)))
     assert np.allclose(made.poses[:, 0, 3], expected, atol=1e-6)  # past its end it goes on straight
 
 
 def test_a_path_goes_through_its_points_and_looks_along() -> None:
     points = np.array([[0.0, 0, 0, np.nan], [1.0, 5, 0, np.nan], [2.0, 10, 3, np.nan]])
-    made = paths.along_points(points, 0.75, slope(0.1))
+    made = edit.along_points(points, 0.75, slope(0.1))
     for t, x, y, _ in points:
         pose = made.pose_at(t)
         assert np.allclose(pose[:3, 3], [x, y, 0.75 + 0.1 * y], atol=0.02)
@@ -156,7 +155,7 @@ def test_overlap_of_boxes_agrees_with_points(yaw: float, x: float, y: float) -> 
     a, b = np.eye(4)[None], geometry.yaw_matrix(yaw, (x, y, 0.2))[None]
     grid = np.stack(np.meshgrid(*(np.linspace(-s / 2, s / 2, 25) for s in SIZE), indexing="ij"), -1).reshape(-1, 3)
     inside = (np.abs(geometry.transform_points(b[0], grid)) <= np.array(SIZE) / 2).all(1).any()
-    depth = boxes.overlap_m(a, SIZE, b, SIZE)[0]
+    depth = edit.overlap_m(a, SIZE, b, SIZE)[0]
     if inside:
         assert depth >= -1e-9
     elif depth > 0.5:
@@ -164,9 +163,9 @@ def test_overlap_of_boxes_agrees_with_points(yaw: float, x: float, y: float) -> 
 
 
 def test_angles_wrap_around() -> None:
-    assert boxes.angle_to_nearest(np.array([math.pi - 0.1]), np.array([-math.pi + 0.1]))[0] == pytest.approx(0.2)
-    assert boxes.angle_to_nearest(np.zeros(1), np.zeros(0))[0] == math.pi
-    assert boxes.azimuths(geometry.yaw_matrix(math.pi / 2)[None], np.array([[0.0, 5, 0]]))[0] == pytest.approx(0.0)
+    assert edit.angle_to_nearest(np.array([math.pi - 0.1]), np.array([-math.pi + 0.1]))[0] == pytest.approx(0.2)
+    assert edit.angle_to_nearest(np.zeros(1), np.zeros(0))[0] == math.pi
+    assert edit.azimuths(geometry.yaw_matrix(math.pi / 2)[None], np.array([[0.0, 5, 0]]))[0] == pytest.approx(0.0)
 
 
 # -- fitted scenes -------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from mudg.base import geometry
 from mudg.base.palette import ID
 from mudg.base.types import FusedCloud, PointCloud, Sweep, SweepPoints
-from mudg.core import lidar as beams
+from mudg.core import lidar
 from mudg.core.edit import HeightMap, Motion
 from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.editing.recorded import edited_points
@@ -41,7 +41,7 @@ def exact(boxes: dict[str, Actor]) -> tuple[np.ndarray, np.ndarray]:
         down = np.where(directions[:, 2] < 0, -2.0 / directions[:, 2], np.inf)
     found, owner = np.minimum(down, WALL_M / directions[:, 0]), np.full(len(directions), -1)
     for index, actor in enumerate(boxes.values()):
-        hit = beams.met_box(directions, geometry.invert(SENSOR) @ actor.motion.poses[0], actor.size_m)
+        hit = lidar.met_box(directions, geometry.invert(SENSOR) @ actor.motion.poses[0], actor.size_m)
         found, owner = np.where(hit < found, hit, found), np.where(hit < found, index, owner)
     return found, owner
 
@@ -82,19 +82,19 @@ def changed(
 def test_beams_meet_boxes_points_and_ground_where_geometry_says() -> None:
     pose = geometry.yaw_matrix(0.3, (10, 1, -1.2))
     directions = fan()
-    hit = beams.met_box(directions, pose, SIZE)
+    hit = lidar.met_box(directions, pose, SIZE)
     local = geometry.transform_points(geometry.invert(pose), directions[np.isfinite(hit)] * hit[np.isfinite(hit), None])
     assert np.abs((np.abs(local) - np.array(SIZE) / 2).max(1)).max() < 1e-9  # on a face
     surface = geometry.transform_points(pose, shell().xyz.astype(np.float64))
-    seen, first = beams.met_points(directions, surface, beams.ball_sizes(shell().xyz.astype(np.float64)))
+    seen, first = lidar.met_points(directions, surface, lidar.ball_sizes(shell().xyz.astype(np.float64)))
     both = np.isfinite(hit) & np.isfinite(seen)
     assert both.sum() > 0.98 * np.isfinite(hit).sum() and np.median(np.abs(seen[both] - hit[both])) < 0.05
     assert (first[np.isfinite(seen)] >= 0).all()
     down = directions[directions[:, 2] < -0.1]
     assert np.allclose(
-        beams.met_ground(down, SENSOR, ground(), np.full(len(down), 1.0), 25.0), -2 / down[:, 2], atol=0.01
+        lidar.met_ground(down, SENSOR, ground(), np.full(len(down), 1.0), 25.0), -2 / down[:, 2], atol=0.01
     )
-    assert np.isinf(beams.met_box(directions, geometry.yaw_matrix(0, (-10, 0, 0)), SIZE)).all()  # behind the sensor
+    assert np.isinf(lidar.met_box(directions, geometry.yaw_matrix(0, (-10, 0, 0)), SIZE)).all()  # behind the sensor
 
 
 def test_beams_that_met_a_removed_object_meet_the_ground_behind_it_or_do_not_come_back() -> None:

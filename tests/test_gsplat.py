@@ -22,7 +22,7 @@ from mudg.core.raster import gsplat_cuda
 from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import ONLY_GSPLAT, RasterConfig, rasterize
-from mudg.steps import diagnosis as doctor
+from mudg.steps import diagnosis
 
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
 IMAGES = ("rgb", "depth", "alpha", "extra")
@@ -485,14 +485,14 @@ def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def test_doctor_says_whether_it_can_be_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    monkeypatch.setattr(doctor, "_installed", lambda name: "1.5.3" if name == "gsplat" else "0")
+    monkeypatch.setattr(diagnosis, "_installed", lambda name: "1.5.3" if name == "gsplat" else "0")
     _pretend_installed(monkeypatch, tmp_path, cuda=False)
-    assert doctor._optional()["gsplat"] == "1.5.3; cannot be used here: no CUDA device is available"
+    assert diagnosis._optional()["gsplat"] == "1.5.3; cannot be used here: no CUDA device is available"
     (tmp_path / "csrc.so").touch()
     _pretend_installed(monkeypatch, tmp_path)
-    assert doctor._optional()["gsplat"] == "1.5.3; its kernels came with it"
-    monkeypatch.setattr(doctor, "_installed", lambda name: None)
-    assert "pip install 'mudg[gsplat]'" in doctor._optional()["gsplat"]
+    assert diagnosis._optional()["gsplat"] == "1.5.3; its kernels came with it"
+    monkeypatch.setattr(diagnosis, "_installed", lambda name: None)
+    assert "pip install 'mudg[gsplat]'" in diagnosis._optional()["gsplat"]
 
 
 @pytest.mark.gpu

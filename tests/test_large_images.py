@@ -11,7 +11,7 @@ import torch
 from mudg.base.crop import cropped
 from mudg.base.errors import ResourceError
 from mudg.base.types import Camera, Condition, Trajectory, View
-from mudg.core import metrics as flicker
+from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.diffusion import synthesize
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
@@ -93,11 +93,11 @@ def test_motion_found_in_bands_is_that_of_the_whole(monkeypatch: pytest.MonkeyPa
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     poses[1, 2, 3] = 0.4
     lens = torch.tensor([20.0, 20.0, 11.5, 18.5], dtype=torch.float64)
-    frames = [flicker.TrueFrame(depth[n], ids[n], poses[n], lens) for n in (0, 1)]
-    whole = flicker.pixel_motion(*frames, {1: poses[1]}, instance)
-    monkeypatch.setattr(flicker, "WHOLE_PIXELS", 0)
-    monkeypatch.setattr(flicker, "BAND_PIXELS", 23 * 8)
-    bands = flicker.pixel_motion(*frames, {1: poses[1]}, instance)
+    frames = [metrics.TrueFrame(depth[n], ids[n], poses[n], lens) for n in (0, 1)]
+    whole = metrics.pixel_motion(*frames, {1: poses[1]}, instance)
+    monkeypatch.setattr(metrics, "WHOLE_PIXELS", 0)
+    monkeypatch.setattr(metrics, "BAND_PIXELS", 23 * 8)
+    bands = metrics.pixel_motion(*frames, {1: poses[1]}, instance)
     assert bands.there.shape == whole.there.shape and whole.same.any()
     torch.testing.assert_close(bands.there, whole.there, rtol=1e-6, atol=1e-6)
     assert torch.equal(bands.same, whole.same)

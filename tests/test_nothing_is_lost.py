@@ -42,8 +42,7 @@ from mudg.networks.codec import CodecConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
-from mudg.steps import conversion as convert
-from mudg.steps import pipeline
+from mudg.steps import conversion, pipeline
 from mudg.steps.annotate import Annotate
 from mudg.steps.convert import Convert
 from mudg.steps.fit import Fit
@@ -443,9 +442,9 @@ def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(tmp_path: Path,
 
     def converted(dtype: str, *, overwrite: bool) -> Path:
         config = ConvertConfig(dtype=dtype, resolution="320x512")
-        return convert.run(config, tmp_path / "512.ckpt", tmp_path / "to", overwrite=overwrite, network=TINY)
+        return conversion.run(config, tmp_path / "512.ckpt", tmp_path / "to", overwrite=overwrite, network=TINY)
 
-    monkeypatch.setattr(convert.processes, "run_limited", lambda work, *_: work() or 0)
+    monkeypatch.setattr(conversion.processes, "run_limited", lambda work, *_: work() or 0)
     to = converted("float32", overwrite=False)
     (to / "mine.md").write_text("mine")
     before = tree(to)

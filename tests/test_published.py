@@ -31,7 +31,7 @@ from mudg.networks import clip
 from mudg.networks.clip import ImageTower, TextTower, TowerConfig
 from mudg.scene.observations import read_observations
 from mudg.scene.settings import FuseConfig
-from mudg.steps import conversion as convert
+from mudg.steps import conversion
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize
 
@@ -445,7 +445,7 @@ def street(tmp_path_factory):
     ToyStreet(times=[0.1 * n for n in range(6)]).write(root / "scene", width=48, height=32)
     Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
     torch.save({"state_dict": tiny_checkpoint()}, root / "512.ckpt")
-    convert.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
+    conversion.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
     return root
 
 

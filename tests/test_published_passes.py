@@ -10,7 +10,7 @@ from test_published import some_condition
 from toy_published import tiny_model
 
 from mudg.base.errors import UsageError
-from mudg.diffusion import views as loading
+from mudg.diffusion import views
 from mudg.diffusion.published.kl_vae import Decoder, Encoder
 from mudg.diffusion.published.model import PublishedConfig, PublishedMDM, WorkSplit
 from mudg.diffusion.published.video_unet import Attention, Resampler, VideoUNet
@@ -163,8 +163,8 @@ def test_settings_of_the_published_kind_alone(tmp_path):
     folder = write_tiny(tmp_path)
     config = SynthesizeConfig(model=str(folder), device="cpu", steps=20)
     with pytest.raises(UsageError, match="on the CPU already"):
-        loading.check_config(replace(config, offload=True), False)
-    checked = loading.check_config(config, False)
+        views.check_config(replace(config, offload=True), False)
+    checked = views.check_config(config, False)
     assert (checked.processes, checked.device) == (1, "cpu")
-    assert loading.load_any(checked).split == WorkSplit(frames_at_once=1)
-    assert loading.load_any(replace(checked, memory_budget_gb=4.0)).split.frames_at_once == 16
+    assert views.load_any(checked).split == WorkSplit(frames_at_once=1)
+    assert views.load_any(replace(checked, memory_budget_gb=4.0)).split.frames_at_once == 16

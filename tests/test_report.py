@@ -28,8 +28,8 @@ from mudg.base.types import Observation
 from mudg.editing.script import read_edits
 from mudg.editing.view_settings import ScoreConfig
 from mudg.steps.score import Score
+from mudg.viewer import report
 from mudg.viewer import report as report_page
-from mudg.viewer import report as run_report
 
 
 def dark(share: float) -> Any:
@@ -64,7 +64,7 @@ def finished_run(out: Path) -> Path:
 
 def written(out: Path) -> Path:
     """The report of a finished run."""
-    return run_report.write_page(out, run_report.film(out))
+    return report.write_page(out, report.film(out))
 
 
 @pytest.fixture(scope="module")
@@ -213,16 +213,16 @@ def test_videos_hold_all_panels_and_play(page: str) -> None:
 def test_panels_show_what_they_say(tmp_path: Path) -> None:
     out = finished_run(tmp_path)
     scores = store.read_json(out / "score" / "metrics.json")
-    folders = run_report._folders(out, scores)
+    folders = report._folders(out, scores)
     assert list(folders) == ["truth", "street_gaussians", "mudg_r", "mudg_s"]
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
-    columns = run_report._columns(course, folders)
+    columns = report._columns(course, folders)
     assert columns.has_truth
-    panels = {c: (run_report._rows(columns, c)) for c in columns.sets}
+    panels = {c: (report._rows(columns, c)) for c in columns.sets}
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
     assert "mudg_r" not in panels
-    atlas = next(run_report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
+    atlas = next(report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
     h, w = toy_views.HEIGHT, toy_views.WIDTH
     assert np.array_equal(atlas[:h, :w], toy_views.colors(0))
     assert abs(atlas[:h, w : 2 * w].astype(int) - np.round(toy_views.colors(0) * 0.8)).max() <= 1
@@ -234,15 +234,15 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
 def test_a_shifted_view_of_a_log_shows_the_recorded_path_beside_it(tmp_path: Path) -> None:
     out = finished_run(tmp_path)
     scores = store.read_json(out / "score" / "metrics.json")
-    folders = run_report._folders(out, scores)
+    folders = report._folders(out, scores)
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 2)
-    columns = run_report._columns(course, folders)
+    columns = report._columns(course, folders)
     assert not columns.has_truth
     assert columns.sets["truth"].trajectory == "front_recorded"
     assert list(columns.indices["truth"]) == [0, 1, 2, 3]
-    panels = {c: (run_report._rows(columns, c)) for c in columns.sets}
+    panels = {c: (report._rows(columns, c)) for c in columns.sets}
     assert all("error" not in rows for rows in panels.values())
-    atlas = next(run_report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
+    atlas = next(report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
     assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colors(0))
 
 
@@ -288,7 +288,7 @@ def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
 
 def test_without_an_encoder_pictures_stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = finished_run(tmp_path)
-    monkeypatch.setattr(run_report, "video_encoders", list)
+    monkeypatch.setattr(report, "video_encoders", list)
     page = written(out).read_text(encoding="utf-8")
     outline(page)
     assert "<video" not in page
@@ -303,7 +303,7 @@ def test_an_unscored_run_is_said(tmp_path: Path) -> None:
 def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = finished_run(tmp_path)
     large = written(out).stat().st_size
-    monkeypatch.setattr(run_report, "BUDGET_BYTES", 1000)
+    monkeypatch.setattr(report, "BUDGET_BYTES", 1000)
     assert written(out).stat().st_size < large
 
 

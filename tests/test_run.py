@@ -22,7 +22,7 @@ from mudg.steps.run import Demo, Run
 from mudg.steps.settings.presets import run_preset
 from mudg.steps.settings.run import RunConfig, with_seed
 from mudg.steps.step import Step
-from mudg.viewer import report as run_report
+from mudg.viewer import report
 
 
 @pytest.fixture
@@ -64,8 +64,8 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return out / "viewer.html"
 
     monkeypatch.setattr(pipeline, "_write_viewer", write_viewer)
-    monkeypatch.setattr(run_report, "film", film)
-    monkeypatch.setattr(run_report, "write_page", write_page)
+    monkeypatch.setattr(report, "film", film)
+    monkeypatch.setattr(report, "write_page", write_page)
     return seen
 
 

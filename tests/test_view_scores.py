@@ -17,8 +17,7 @@ from mudg.base.types import Camera, Observation, Scene, Track, View
 from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
 from mudg.city.world import CityWorld
-from mudg.core import metrics as flicker
-from mudg.core import trajectory, view_metrics
+from mudg.core import metrics, trajectory, view_metrics
 from mudg.core.metrics import Pair, ViewFacts
 from mudg.core.street_scores import nta_truths
 from mudg.editing.view_settings import ScoreConfig
@@ -350,5 +349,5 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
 
 def test_without_boxes_vehicles_do_not_count() -> None:
     pairs = [wall_pair(n, torch.zeros(3, 16, 24), 8) for n in (0, 1)]
-    frames = [flicker.TrueFrame.of(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
-    assert not flicker.pixel_motion(*frames).same[:, 8:12].any()
+    frames = [metrics.TrueFrame.of(p.view, p.truth_depth, p.truth_semantics) for p in pairs]
+    assert not metrics.pixel_motion(*frames).same[:, 8:12].any()

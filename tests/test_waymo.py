@@ -19,8 +19,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
-from mudg.formats.importers.waymo import messages, sensors, tfrecord
-from mudg.formats.importers.waymo import records as tracks
+from mudg.formats.importers.waymo import messages, records, sensors, tfrecord
 from mudg.formats.importers.waymo.parquet import ParquetTable
 from mudg.formats.importers.waymo.records import WaymoBox
 from mudg.formats.importers.waymo.tfrecord import TfrecordLog
@@ -98,14 +97,14 @@ def test_points_count_for_the_moment_that_puts_them_inside() -> None:
     seen = np.linspace(0.03, 0.04, len(grid))
     for index, held in enumerate((0.035, 0.0, 0.05)):
         points = on_box + (seen - held)[:, None] * 20.0 * forward
-        counts = tracks.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
+        counts = records.points_inside(box, 20.0 * forward, points, seen, 0.035, 0.05)
         assert counts[index] == len(grid)
         assert counts.argmax() == index
         assert np.delete(counts, index).max() < 0.95 * len(grid)
-        assert tracks.choose_moment(counts) == tracks.MOMENTS[index]
+        assert records.choose_moment(counts) == records.MOMENTS[index]
     low = on_box - [0, 0, 0.75]
-    assert tracks.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
-    assert tracks.choose_moment(np.array([100, 104, 90])) == "seen"
+    assert records.points_inside(box, np.zeros(3), low, seen, 0.0, 0.0).tolist() == [0, 0, 0]  # the road
+    assert records.choose_moment(np.array([100, 104, 90])) == "seen"
 
 
 @roundtrip.needs_native

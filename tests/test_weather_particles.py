@@ -11,8 +11,7 @@ import pytest
 from mudg.base import geometry
 from mudg.base.types import Camera, SweepPoints, View
 from mudg.base.weather_settings import FogSettings, RainSettings, WeatherSettings
-from mudg.core.weather import air as particles
-from mudg.core.weather import lidar
+from mudg.core.weather import air, lidar
 
 
 def view_at(x: float = 0.0, yaw: float = 0.0, time_s: float = 0.0, size: tuple[int, int] = (60, 40)) -> View:
@@ -30,16 +29,16 @@ def view_at(x: float = 0.0, yaw: float = 0.0, time_s: float = 0.0, size: tuple[i
 def test_numbers_and_areas_of_drops_agree_with_integration(mm_h: float) -> None:
     d = np.linspace(1, 5, 400_001)
     n = 8000 * np.exp(-4.1 * mm_h**-0.21 * d)
-    sizes = particles.rain_sizes(mm_h)
+    sizes = air.rain_sizes(mm_h)
     assert sum(s.density for s in sizes) == pytest.approx(np.trapezoid(n, d), rel=1e-6)
-    assert particles.area_per_m(sizes) == pytest.approx(np.trapezoid(n * math.pi / 4 * d**2, d) * 1e-6, rel=1e-6)
+    assert air.area_per_m(sizes) == pytest.approx(np.trapezoid(n * math.pi / 4 * d**2, d) * 1e-6, rel=1e-6)
 
 
 @pytest.mark.parametrize("mm_h", [5.0, 10.0, 50.0])
 def test_the_published_extinction_of_rain_is_twice_the_area_of_the_drops(mm_h: float) -> None:
     slope = 4.1 * mm_h**-0.21
     both = 2 * math.pi / 4 * 8000 * 2 / slope**3 * 1e-6
-    assert particles.rain_extinction(mm_h) == pytest.approx(both, rel=0.2)
+    assert air.rain_extinction(mm_h) == pytest.approx(both, rel=0.2)
 
 
 def test_drops_carry_the_water_of_the_rate() -> None:
@@ -52,7 +51,7 @@ def test_drops_carry_the_water_of_the_rate() -> None:
 
 # --- places -----------------------------------------------------------------------------------------------------------
 
-SIZE = particles.ParticleSize(60.0, 0.002, 5.0)
+SIZE = air.ParticleSize(60.0, 0.002, 5.0)
 FALL = np.array([0.0, 0.0, -5.0])
 
 
@@ -62,7 +61,7 @@ def rows(xyz: np.ndarray) -> set[tuple[float, ...]]:
 
 def test_two_cameras_see_the_same_drops() -> None:
     left, right = view_at(yaw=0.15), view_at(yaw=-0.15)
-    a, b = (particles.places(SIZE, FALL, view, 6.0, 99) for view in (left, right))
+    a, b = (air.places(SIZE, FALL, view, 6.0, 99) for view in (left, right))
 
     def both(xyz: np.ndarray) -> np.ndarray:
         seen = [geometry.project(view, xyz) for view in (left, right)]
@@ -71,13 +70,13 @@ def test_two_cameras_see_the_same_drops() -> None:
 
     assert len(both(a)) > 200
     assert rows(both(a)) == rows(both(b))
-    assert rows(particles.places(SIZE, FALL, left, 6.0, 100)) != rows(a)
+    assert rows(air.places(SIZE, FALL, left, 6.0, 100)) != rows(a)
 
 
 def test_drops_fall_with_their_speed() -> None:
     now, later = view_at(time_s=3.0), view_at(time_s=3.02)
-    a = particles.places(SIZE, FALL, now, 5.0, 1)
-    b = particles.places(SIZE, FALL, later, 5.0, 1)
+    a = air.places(SIZE, FALL, now, 5.0, 1)
+    b = air.places(SIZE, FALL, later, 5.0, 1)
     shared = rows(a + FALL * 0.02) & rows(b)
     assert len(shared) > 0.8 * len(a)
 
@@ -86,7 +85,7 @@ def test_the_number_of_drops_is_that_of_the_volume() -> None:
     view = view_at()
     counts = []
     for key in range(12):
-        xyz = particles.places(SIZE, FALL, view, 6.0, key)
+        xyz = air.places(SIZE, FALL, view, 6.0, key)
         uv, z = geometry.project(view, xyz)
         inside = (uv[:, 0] > 0) & (uv[:, 0] < 60) & (uv[:, 1] > 0) & (uv[:, 1] < 40)
         counts.append(np.sum(inside & (z > 0) & (z < 5)))
@@ -101,18 +100,18 @@ def test_the_number_of_drops_is_that_of_the_volume() -> None:
 @pytest.mark.parametrize("velocity", [(0, 0, 0), (0, 0, -6.0), (15.0, 0, -6)], ids=["still", "falling", "driving"])
 def test_a_drop_covers_the_area_of_its_disc_whatever_its_streak(velocity: tuple[float, float, float]) -> None:
     view = view_at(size=(300, 200))
-    moving = particles.Moving(np.array([[4.0, 0.4, 1.6]]), np.array(velocity, float), 0.02, 0.02)
+    moving = air.Moving(np.array([[4.0, 0.4, 1.6]]), np.array(velocity, float), 0.02, 0.02)
     depth = np.full((200, 300), 50.0, np.float32)
-    shown = particles.covered(view, depth, moving)
+    shown = air.covered(view, depth, moving)
     stretch = math.sqrt(1 + 0.1**2 + 0.025**2)  # off the axis
     assert shown.sum() == pytest.approx(stretch * math.pi / 4 * (50 * 0.02 / 4.0) ** 2, rel=1e-6)
-    assert particles.covered(view, np.full_like(depth, 3.0), moving).sum() == 0  # behind a surface
+    assert air.covered(view, np.full_like(depth, 3.0), moving).sum() == 0  # behind a surface
 
 
 def test_rows_of_a_streak_follow_the_motion() -> None:
     view = view_at(size=(300, 200))
-    moving = particles.Moving(np.array([[2.0, 0.0, 1.5]]), np.array([0, 0, -8.0]), 0.002, 0.05)
-    shown = particles.covered(view, np.full((200, 300), 50.0), moving)
+    moving = air.Moving(np.array([[2.0, 0.0, 1.5]]), np.array([0, 0, -8.0]), 0.002, 0.05)
+    shown = air.covered(view, np.full((200, 300), 50.0), moving)
     lit = np.flatnonzero(shown.sum(1))
     assert lit[-1] - lit[0] == pytest.approx(50 * 8 * 0.05 / 2.0, abs=2)
     assert np.flatnonzero(shown.sum(0)).tolist() == [149, 150]
@@ -120,11 +119,11 @@ def test_rows_of_a_streak_follow_the_motion() -> None:
 
 def test_all_drops_together_cover_what_the_density_says() -> None:
     """Mean optical depth = area of the drops per metre x metres, within 5 %."""
-    sizes = particles.rain_sizes(50.0)
-    what = particles.Falling(sizes, (0.0, 0.0), 6.0, 0.01, "rain")
+    sizes = air.rain_sizes(50.0)
+    what = air.Falling(sizes, (0.0, 0.0), 6.0, 0.01, "rain")
     depth = np.full((40, 60), 100.0)
-    shown = [particles.falling(view_at(time_s=t), depth, what, (0, 0, 0), 5).mean() for t in (0.0, 1.0, 2.0, 3.0)]
-    assert np.mean(shown) == pytest.approx(particles.area_per_m(sizes) * (6.0 - particles.NEAREST_M), rel=0.05)
+    shown = [air.falling(view_at(time_s=t), depth, what, (0, 0, 0), 5).mean() for t in (0.0, 1.0, 2.0, 3.0)]
+    assert np.mean(shown) == pytest.approx(air.area_per_m(sizes) * (6.0 - air.NEAREST_M), rel=0.05)
 
 
 # --- LiDAR ------------------------------------------------------------------------------------------------------------

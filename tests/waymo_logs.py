@@ -15,7 +15,7 @@ import write_waymo as made
 from mudg.base import geometry
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import Scene, Track
-from mudg.city import sensors as rig
+from mudg.city import sensors
 from mudg.formats.importers import IMPORTERS
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene.read import read_scene
@@ -71,4 +71,4 @@ def _city(folder: Path) -> tuple[Scene, tuple[Track, ...]]:
 
 @functools.cache
 def _written(folder: Path) -> made.Log:
-    return made.log_of(*_city(folder), beams=rig.lidar_elevations(roundtrip.SMALL), columns=COLUMNS)
+    return made.log_of(*_city(folder), beams=sensors.lidar_elevations(roundtrip.SMALL), columns=COLUMNS)

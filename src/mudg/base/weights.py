@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mudg.base import checkpoint as shards
+from mudg.base import checkpoint
 from mudg.base.errors import InputError
 from mudg.base.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
 
@@ -368,7 +368,7 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError("no such checkpoint", where=str(path))
     if path.suffix == ".safetensors":
-        return _without_prefix(shards.read_tensors(path))
+        return _without_prefix(checkpoint.read_tensors(path))
     if is_torchscript(path):
         return _without_prefix(read_torchscript(path))
     content = _unpickle(path)

@@ -40,11 +40,8 @@ from mudg.benchmarks import page as pages
 from mudg.benchmarks.edit import drawn_pixels
 from mudg.benchmarks.loop import finished
 from mudg.benchmarks.settings import BenchConfig
-from mudg.core import lidar as points_seen
-from mudg.core import metrics, pictures
+from mudg.core import lidar, metrics, pictures, street_scores, view_metrics
 from mudg.core import metrics as flicker
-from mudg.core import street_scores as box_scores
-from mudg.core import view_metrics as edit_scores
 from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints
@@ -121,7 +118,7 @@ class Video:
         mine = np.zeros(seen.rgb.shape[1:], bool) if pose is None else drawn_pixels(self.model, self.actor, view)
         if pose is not None:
             shown = outlines(view, [(pose, np.asarray(self.size_m, np.float64))])
-            common, either = edit_scores.mask_counts(mine, shown)
+            common, either = view_metrics.mask_counts(mine, shown)
             self.common, self.either = self.common + common, self.either + either
         now = (seen, _carrier(seen), mine)
         if self.before is not None:
@@ -203,10 +200,10 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         (old, stood), (new, stands) = usual.add(frame.view), edited.add(frame.view)
         touched, freed = _regions(drive.plan, frame.view, stood, stands)
         if weather:
-            sums.structure += [value for value in [edit_scores.gradient_correlation(new.rgb, old.rgb)] if value is not None]
+            sums.structure += [value for value in [view_metrics.gradient_correlation(new.rgb, old.rgb)] if value is not None]
         else:
             sums.away += int((~touched).sum())
-            sums.changed += int((edit_scores.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
+            sums.changed += int((view_metrics.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
         _add_points(case, drive.plan, frame, (old, new), (touched, freed), sums)
         if shown is not None:
             shown(number, old, new)
@@ -272,7 +269,7 @@ def _add_points(
     if around is not None:
         rows = np.flatnonzero(around.owner == STATIC)
         still = around.taken(rows)
-        depth, index = points_seen.visible(frame.view, still.xyz, still.gap_deg)
+        depth, index = lidar.visible(frame.view, still.xyz, still.gap_deg)
         sums.add_depth("uncovered", new, depth, (depth > 0) & freed)
         color, known = _recorded_colors(case, plan, around)
         asked = freed & (index >= 0)
@@ -293,7 +290,7 @@ def _recorded_colors(case: RunCase, plan: EditPlan, points: OwnedPoints) -> tupl
         spoilt = boxes_mask(frame.view, boxes) | ground_mask(frame.view, boxes)
         image = np.dstack([read_image(case.scene, frame), spoilt.astype(np.uint8)])
         placed = case.points.placed(points, frame.view.time_s)
-        found, there = points_seen.carried(frame.view, image, placed, points.gap_deg)
+        found, there = lidar.carried(frame.view, image, placed, points.gap_deg)
         fresh = there[:-1] & ~known & (found[:-1, 3] == 0)
         color[fresh], known = found[:-1][fresh, :3], known | fresh
     return color, known
@@ -455,13 +452,13 @@ def lead_of(scene: Scene, model: SceneModel, frames: Sequence[Frame], points: Lo
         InputError: there is none.
     """
     nodes = model.node_names()
-    tracks = [t for t in points.dynamic if t.id in nodes and t.label in box_scores.VEHICLE_LABELS]
+    tracks = [t for t in points.dynamic if t.id in nodes and t.label in street_scores.VEHICLE_LABELS]
     chosen = [frames[int(i)].view for i in np.unique(np.linspace(0, len(frames) - 1, min(LOOKS, len(frames))).round())]
     areas = {track.id: 0.0 for track in tracks}
     for track in tracks:
         for view in chosen:
             pose = track.pose_at(view.time_s)
-            box = None if pose is None else box_scores.clipped_box(view, pose, track.size_m)
+            box = None if pose is None else street_scores.clipped_box(view, pose, track.size_m)
             if box is not None:
                 edge = np.array([view.camera.width, view.camera.height], np.float64)
                 areas[track.id] += float((np.clip(box[2:], 0, edge) - np.clip(box[:2], 0, edge)).prod())

@@ -14,7 +14,7 @@ import torch
 from mudg.base import log
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.benchmarks.settings import BenchConfig
-from mudg.core import metrics as flicker
+from mudg.core import metrics
 from mudg.diffusion import files as mdm_files
 from mudg.diffusion.clips import from_city
 from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions
@@ -96,8 +96,8 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     rgb = torch.stack([torch.from_numpy(t.rgb.copy()).permute(2, 0, 1) for t in truths])
     depth = torch.stack([torch.from_numpy(t.depth.copy())[None] for t in truths]).clamp(max=1000.0)
     ids = torch.stack([torch.from_numpy(t.semantics.astype("int64")) for t in truths])
-    true_frames = [flicker.TrueFrame.of(*one) for one in zip(small, depth, ids, strict=True)]
-    pairs = flicker.changes(torch.stack(frames), rgb, true_frames)
+    true_frames = [metrics.TrueFrame.of(*one) for one in zip(small, depth, ids, strict=True)]
+    pairs = metrics.changes(torch.stack(frames), rgb, true_frames)
     ratios = [m / t if t > 0 else math.nan for m, t in pairs]
     seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731

@@ -13,7 +13,7 @@ from mudg.base.plain_yaml import parse_yaml
 from mudg.benchmarks.papers import PaperTable
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import files as mdm_files
-from mudg.diffusion import views as loading
+from mudg.diffusion import views
 from mudg.diffusion.published.model import is_published
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.gaussians.methods import METHODS, PUBLISHED
@@ -171,7 +171,7 @@ def refuse_unfit(config: BenchConfig, preset: PresetName, rows: Sequence[Row], g
     if generators or virtual:
         refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
     for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
-        loading.check_config(generator, fitted=False)
+        views.check_config(generator, fitted=False)
 
 
 # ---- rows ----

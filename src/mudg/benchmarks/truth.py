@@ -25,16 +25,14 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Scene, View
 from mudg.benchmarks.places import Protocol
-from mudg.core import calibration as color_match
-from mudg.core import lidar as points_seen
-from mudg.core import trajectory
+from mudg.core import calibration, lidar, trajectory
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import OwnedPoints, ShownFrame
 from mudg.core.pictures import class_colors, depth_colors
 from mudg.formats.exporters.video import jpeg_bytes
 from mudg.labels.inputs import box_outline
 from mudg.scene.read import read_image, read_scene
-from mudg.scoring import truth as log_points
+from mudg.scoring import truth
 from mudg.scoring.truth import LogPoints
 from mudg.steps.outputs import Output
 
@@ -182,7 +180,7 @@ class _Maker:
         self.shown: list[ShownFrame] = []
         if "seen" in protocol.maps:
             labelled = read_scene(seen)
-            found = (log_points.shown_frame(labelled, f, read_image(labelled, f)) for f in labelled.frames_in("train"))
+            found = (truth.shown_frame(labelled, f, read_image(labelled, f)) for f in labelled.frames_in("train"))
             self.shown = [frame for frame in found if frame is not None]
 
     def unsuitable(self, frames: Sequence[Frame]) -> str:
@@ -211,7 +209,7 @@ class _Maker:
                 return None
             points = OwnedPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.uint8), 0.4)
         world = self.points.placed(points, view.time_s)
-        depth, index = points_seen.visible(view, world, points.gap_deg)
+        depth, index = lidar.visible(view, world, points.gap_deg)
         found: dict[str, NDArray[Any]] = {"depth": depth}
         owner = np.append(points.owner, STATIC)[index]
         if "dynamic" in wanted:
@@ -243,16 +241,16 @@ class _Maker:
         points = self.points.around(view.time_s)
         if points is None:
             return np.zeros(shape, bool), nothing, nothing
-        _, index = points_seen.visible(view, self.points.placed(points, view.time_s), points.gap_deg)
+        _, index = lidar.visible(view, self.points.placed(points, view.time_s), points.gap_deg)
         rows, columns = np.nonzero(index >= 0)
-        seen, there = points_seen.seen_by(self.points.placed, points.taken(index[rows, columns]), self.shown, view.time_s)
-        here = points_seen.blurred(read_image(self.scene, frame))[rows, columns]
-        return points_seen.spread(seen, rows, columns, shape), there[seen], here[seen]
+        seen, there = lidar.seen_by(self.points.placed, points.taken(index[rows, columns]), self.shown, view.time_s)
+        here = lidar.blurred(read_image(self.scene, frame))[rows, columns]
+        return lidar.spread(seen, rows, columns, shape), there[seen], here[seen]
 
     def color_map(self, frames: Sequence[Frame]) -> ColorMap:
         """The colour map of a camera, from the points that its training frames share with the shown cameras."""
         pairs = [self._seen(frame)[1:] for frame in frames]
-        return color_match.color_map(*(np.concatenate([pair[side] for pair in pairs]) for side in (0, 1)))
+        return calibration.color_map(*(np.concatenate([pair[side] for pair in pairs]) for side in (0, 1)))
 
 
 # ---- pictures ----------------------------------------------------------------------------------------------------------

@@ -21,8 +21,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, EgoPath, Observation, Source, SweepPoints, Track, View
 from mudg.city import objects as rec
-from mudg.city import paint
-from mudg.city import sensors as rig
+from mudg.city import paint, sensors
 from mudg.city.config import CityConfig
 from mudg.city.furnish import furnish
 from mudg.city.layout import StreetPlan, plan_streets
@@ -112,8 +111,8 @@ class CityWorld:
         self._gaits = np.array([m.gait_rad_per_s for m in self.objects], np.float64)
         self._gait_starts = seeds.numpy_rng(config.seed, 0, "city gait").uniform(0, 2 * np.pi, len(self.objects))
         self._handle = self._native_world()
-        self._cameras = rig.cameras(config)
-        self._mounts = rig.ego_from_camera(config)
+        self._cameras = sensors.cameras(config)
+        self._mounts = sensors.ego_from_camera(config)
         self._ego_path = EgoPath(self._ego_times, self._ego_poses)
 
     def _native_world(self) -> CityHandle:
@@ -374,7 +373,7 @@ class CityWorld:
         rgb, depth, semantics, instance = zip(*parts, strict=True)
         return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
 
-    def lidar_sweep(self, index: int, scan: rig.LidarScan | None = None) -> CitySweep:
+    def lidar_sweep(self, index: int, scan: sensors.LidarScan | None = None) -> CitySweep:
         """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.
         Vehicle and objects move during the turn; the limbs of people keep their pose of the middle. ``scan``: another LiDAR than the
         configuration's; with a delay, points and pose are what a log has whose clock is wrong by it."""
@@ -383,10 +382,10 @@ class CityWorld:
             raise UsageError("there is no such sweep", expected=f"0..{config.n_frames - 1}", got=str(index))
         time_s = self.frame_time(index)
         period = 1.0 / config.rate_hz
-        azimuths = rig.lidar_azimuths(config)
+        azimuths = sensors.lidar_azimuths(config)
         offsets = (np.arange(len(azimuths)) + 0.5) / len(azimuths) * period - period / 2
         knots = np.array([time_s - period / 2, time_s, time_s + period / 2])
-        scan = scan or rig.LidarScan(rig.ego_from_lidar(), rig.lidar_elevations(config))
+        scan = scan or sensors.LidarScan(sensors.ego_from_lidar(), sensors.lidar_elevations(config))
         mount = scan.ego_from_lidar
         time_s += scan.delay_s
         knots = np.clip(knots + scan.delay_s, *self.span_s)

@@ -21,7 +21,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.types import Track
 from mudg.core import metrics as flicker
-from mudg.core import street_scores as lane_scores
+from mudg.core import street_scores
 from mudg.core.lidar import PointTruth
 from mudg.core.metrics import CLASS_COUNT, FrameMean, Metric, Pair, confusion, depth_errors, iou_of, neighbour_of
 from mudg.core.street_scores import agent_ious
@@ -240,8 +240,8 @@ def _lanes_of(pair: Pair) -> LaneCounts | None:
     lanes = None if pair.facts is None else pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.exact:
         return None
-    found = lane_scores.bright_stripes(pair.rgb.numpy(), lanes.road)
-    hits, union = lane_scores.tolerant_iou(found, lanes.marking)
+    found = street_scores.bright_stripes(pair.rgb.numpy(), lanes.road)
+    hits, union = street_scores.tolerant_iou(found, lanes.marking)
     rest, true_rest = lanes.road & ~found, lanes.road & ~lanes.marking
     return LaneCounts(hits, union, float((rest & true_rest).sum()), float((rest | true_rest).sum()))
 
@@ -250,9 +250,9 @@ def _lane_edges(pair: Pair) -> float | None:
     lanes = None if pair.facts is None else pair.facts.lanes
     if lanes is None or pair.rgb is None or not lanes.band.any():
         return None
-    rows = lane_scores.rows_of(lanes.band, 1)
-    made, true = (lane_scores.edges_of(lane_scores.gray_of(rgb[:, rows])) for rgb in (pair.rgb.numpy(), lanes.reference))
-    return lane_scores.edge_correlation(made, true, lanes.band[rows])
+    rows = street_scores.rows_of(lanes.band, 1)
+    made, true = (street_scores.edges_of(street_scores.gray_of(rgb[:, rows])) for rgb in (pair.rgb.numpy(), lanes.reference))
+    return street_scores.edge_correlation(made, true, lanes.band[rows])
 
 
 def _lane_colors(pair: Pair) -> tuple[float, int] | None:

@@ -14,8 +14,7 @@ from typing import Any
 
 import torch
 
-from mudg.base import checkpoint as shards
-from mudg.base import records, store
+from mudg.base import checkpoint, records, store
 from mudg.base.errors import InputError
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.networks.codec import SHIPPED
@@ -104,7 +103,7 @@ def _without_former(values: Any, group: str, where: str) -> Any:
 def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
     """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
     with store.atomic_directory(folder) as partial:
-        files = shards.write_shards(partial, model.state_dict(), SHARD_BYTES, torch.float16)
+        files = checkpoint.write_shards(partial, model.state_dict(), SHARD_BYTES, torch.float16)
         store.write_text(partial / "MODEL_CARD.md", card)
         description = {"schema": 1, "config": dataclasses.asdict(model.config), "files": files, "facts": dict(facts)}
         store.write_json(partial / MODEL_FILE, description)
@@ -120,10 +119,10 @@ def load(path: Path | str = "embedded") -> MDM:
     """
     folder = folder_of(path)
     content = read_description(folder)
-    config, state = config_from_dict(content.get("config"), str(folder / MODEL_FILE)), shards.read_shards(folder, content["files"])
+    config, state = config_from_dict(content.get("config"), str(folder / MODEL_FILE)), checkpoint.read_shards(folder, content["files"])
     with records.understood("a diffusion model", str(folder / MODEL_FILE)):
         with torch.device("meta"):  # takes no memory: its size may be anything
-            shards.check_fit(state, MDM(config).state_dict(), folder)
+            checkpoint.check_fit(state, MDM(config).state_dict(), folder)
         model = MDM(config)
     model.load_state_dict(state)  # the numbers are converted as they are copied: no second set of them is in memory
     return model.eval()

@@ -21,7 +21,7 @@ from mudg.base import geometry, log, seeds
 from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import Frame, FusedCloud, Observation, Photo, PointCloud, Scene, Sweep, SweepPoints, View
-from mudg.core import lidar as beams
+from mudg.core import lidar
 from mudg.core.edit import HeightMap, Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
@@ -142,11 +142,11 @@ def _beyond(
     found = np.full(len(directions), np.inf)
     if plan.before.ground is None or not len(rows):
         return found
-    free = beams.met_ground(directions[rows], sweep.world_from_lidar, plan.before.ground, ranges[rows], BEHIND_M)
+    free = lidar.met_ground(directions[rows], sweep.world_from_lidar, plan.before.ground, ranges[rows], BEHIND_M)
     for name, actor in plan.after.actors.items():
         pose = None if name in plan.touched() else _pose(actor.motion, sweep)
         if pose is not None:
-            free = np.where(beams.met_box(directions[rows], pose, actor.size_m) < free, np.inf, free)
+            free = np.where(lidar.met_box(directions[rows], pose, actor.size_m) < free, np.inf, free)
     found[rows] = free
     return found
 
@@ -181,13 +181,13 @@ def _on_object(
     pose = _pose(actor.motion, sweep)
     if pose is None:
         return hit, ids
-    around = beams.met_box(directions, pose, np.array(actor.size_m) + 2 * beams.LARGEST_M)
+    around = lidar.met_box(directions, pose, np.array(actor.size_m) + 2 * lidar.LARGEST_M)
     rows = np.flatnonzero(np.isfinite(around))
     if surface is None or not len(surface.xyz):
-        hit[rows] = beams.met_box(directions[rows], pose, actor.size_m)
+        hit[rows] = lidar.met_box(directions[rows], pose, actor.size_m)
         return hit, ids
     own = surface.xyz.astype(np.float64)
-    hit[rows], first = beams.met_points(directions[rows], geometry.transform_points(pose, own), beams.ball_sizes(own))
+    hit[rows], first = lidar.met_points(directions[rows], geometry.transform_points(pose, own), lidar.ball_sizes(own))
     if surface.semantics is not None:
         ids[rows] = np.where(first >= 0, surface.semantics[first], kind)
     return hit, ids

@@ -15,9 +15,8 @@ from mudg.base.types import Scene
 from mudg.formats.importers import IMPORTERS, RECOGNISERS, files_of
 from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution, processors
 from mudg.formats.settings import IngestConfig
-from mudg.scene import check as alignment
+from mudg.scene import check, contact_sheet
 from mudg.scene import check as scene_check
-from mudg.scene import contact_sheet
 from mudg.scene.read import read_scene
 from mudg.scene.write import SceneWriter
 
@@ -81,10 +80,10 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict
 
 def _alignment(scene: Scene) -> dict[str, Any]:
     """How the images fit the LiDAR, for the summary; a warning for a doubtful camera."""
-    found = alignment.camera_alignment(scene)
+    found = check.camera_alignment(scene)
     for name, one in found.items():
-        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {alignment.describe(name, one)}")
-    return {"alignment": {name: alignment.to_json(one) for name, one in found.items()}}
+        (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {check.describe(name, one)}")
+    return {"alignment": {name: check.to_json(one) for name, one in found.items()}}
 
 
 _SCENE = "scene"

@@ -29,7 +29,7 @@ from mudg.base import geometry
 from mudg.base.types import Gaussians
 from mudg.core.harmonics import left_product_matrix
 from mudg.core.raster.rasterize import RasterConfig, rasterize
-from mudg.gaussians import nodes as motion
+from mudg.gaussians import nodes
 from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.model import SceneModel, compose, composite_sky
 from mudg.gaussians.nodes import RigidNode
@@ -195,10 +195,10 @@ def _move(node: RigidNode, evidence: PoseEvidence) -> NDArray[np.float64]:
     system = np.zeros((keys, 4, keys, 4))
     for key in range(keys):
         system[key, :, key, :] = evidence.matrix[key] + np.diag([TRUST_M**-2] * 3 + [TRUST_RAD**-2])
-    difference = motion.second_differences(node.times_s)
-    path = np.einsum("mk,kwc->mwkc", difference, base[:, :3, :3]) / motion.ACCELERATION_M_S2
+    difference = nodes.second_differences(node.times_s)
+    path = np.einsum("mk,kwc->mwkc", difference, base[:, :3, :3]) / nodes.ACCELERATION_M_S2
     system[:, :3, :, :3] += np.einsum("mwkc,mwld->kcld", path, path, optimize=True)
-    system[:, 3, :, 3] += difference.T @ difference / motion.YAW_ACCELERATION_RAD_S2**2
+    system[:, 3, :, 3] += difference.T @ difference / nodes.YAW_ACCELERATION_RAD_S2**2
     right = evidence.vector + np.einsum("kcd,kd->kc", evidence.matrix, now)
     found = np.linalg.solve(system.reshape(4 * keys, 4 * keys), right.reshape(4 * keys)).reshape(keys, 4)
     largest = np.array([LARGEST_M] * 3 + [LARGEST_RAD])

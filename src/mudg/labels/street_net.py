@@ -21,8 +21,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint as shards
-from mudg.base import records, store
+from mudg.base import checkpoint, records, store
 from mudg.base.config import STRICT
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, ID
@@ -155,8 +154,8 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
         raise InputError("not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1")
     with records.understood("a segmentation network", str(where)):
         net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
-    state = shards.read_shards(where.parent, content.get("files"))
-    shards.check_fit(state, net.state_dict(), where.parent)
+    state = checkpoint.read_shards(where.parent, content.get("files"))
+    checkpoint.check_fit(state, net.state_dict(), where.parent)
     net.load_state_dict({name: value.float() for name, value in state.items()})
     return net.eval().to(memory_format=torch.channels_last)
 

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint as shards
-from mudg.base import palette, records, store
+from mudg.base import checkpoint, palette, records, store
 from mudg.base.errors import UsageError
 
 Modality = Literal["rgb", "depth", "semantics"]
@@ -234,6 +233,6 @@ def shipped_codec() -> PatchCodec:
     """The codec of the shipped diffusion model."""
     content, prefix = store.read_json(SHIPPED / "model.json"), "codec."
     codec = PatchCodec(records.parse_dataclass(CodecConfig, content["config"]["codec"], "codec: "))
-    state = shards.read_shards(SHIPPED, content["files"])
+    state = checkpoint.read_shards(SHIPPED, content["files"])
     codec.load_state_dict({name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)})
     return codec.eval()

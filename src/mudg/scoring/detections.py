@@ -22,8 +22,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError
 from mudg.base.types import Scene, Track, View
 from mudg.city.world import CityWorld
-from mudg.core import street_scores as box_scores
-from mudg.core import street_scores as lane_scores
+from mudg.core import street_scores
 from mudg.core.fusion import points_in_box
 from mudg.core.street_scores import (
     NTA_CONFIDENCE,
@@ -147,10 +146,10 @@ class BoxDetections:
             return score_tables.NO_DETECTIONS
         values: dict[str, list[float]] = {"value": [], "car_and_bus": []}
         for name, view in zip(images.names(), images.views, strict=True):
-            truths = [box for _, box in box_scores.nta_truths(view, self._tracks_at(view), self._as_published)]
+            truths = [box for _, box in street_scores.nta_truths(view, self._tracks_at(view), self._as_published)]
             own = self._found.get(name, [])
-            values["value"] += box_scores.nta_iou(truths, [d.box for d in own])
-            values["car_and_bus"] += box_scores.nta_iou(truths, [d.box for d in own if d.category in CAR_AND_BUS])
+            values["value"] += street_scores.nta_iou(truths, [d.box for d in own])
+            values["car_and_bus"] += street_scores.nta_iou(truths, [d.box for d in own if d.category in CAR_AND_BUS])
         if not values["value"]:
             return score_tables.NO_TRUTH
         return {"truths": len(values["value"]), **{k: round(sum(v) / len(v), 6) for k, v in values.items()}}
@@ -158,7 +157,7 @@ class BoxDetections:
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""
         return {
-            "file_sha256": self.sha256, "confidence_above": NTA_CONFIDENCE, "reach_px": box_scores.NTA_REACH_PX,
+            "file_sha256": self.sha256, "confidence_above": NTA_CONFIDENCE, "reach_px": street_scores.NTA_REACH_PX,
             "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX], "classes": "all; beside it COCO's car and bus alone (2 and 5)",
             "boxes": "as published: corners behind the camera are not cut off" if self._as_published else "cut at the near plane",
             "fewest_points": NTA_FEWEST_POINTS if self._scene.sweeps else None,
@@ -216,8 +215,8 @@ class LaneDetections:
             return score_tables.NO_DETECTIONS
         values, lanes = [], []
         for path, view in zip(files, images.views, strict=True):
-            found, true = lane_scores.at_lane_size(read_mask(path)), lane_scores.lane_truth(view, self._lines)
-            values.append(lane_scores.ntl_iou(found, true))
+            found, true = street_scores.at_lane_size(read_mask(path)), street_scores.lane_truth(view, self._lines)
+            values.append(street_scores.ntl_iou(found, true))
             union = int((found | true).sum())
             lanes.append(float((found & true).sum() / union) if union else 0.0)
         return {
@@ -234,8 +233,8 @@ class LaneDetections:
         ]
         if not pairs or not all(path.is_file() for pair in pairs for path in pair):
             return None
-        masks = [[lane_scores.at_lane_size(read_mask(path)) for path in pair] for pair in pairs]
-        return round(sum(lane_scores.ntl_iou(a, b) for a, b in masks) / len(masks), 6)
+        masks = [[street_scores.at_lane_size(read_mask(path)) for path in pair] for pair in pairs]
+        return round(sum(street_scores.ntl_iou(a, b) for a, b in masks) / len(masks), 6)
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""

@@ -17,8 +17,7 @@ from mudg.base.errors import InputError
 from mudg.base.palette import ID, UNLABELLED
 from mudg.base.types import Frame, Observation, Scene, Track, View
 from mudg.city.world import CityTruth, CityWorld
-from mudg.core import metrics
-from mudg.core import street_scores as lane_scores
+from mudg.core import metrics, street_scores
 from mudg.core.fusion import STATIC
 from mudg.core.metrics import LaneFacts, Pair, ViewFacts
 from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
@@ -86,16 +85,16 @@ class FactMaker:
         plane = ground_near(points.xyz[points.owner == STATIC], self._path, view.center_world)
         if plane is None:
             return None
-        places = lane_scores.plane_points(view, plane)
+        places = street_scores.plane_points(view, plane)
         rgb = np.asarray(read_image(self._scene, frame)).transpose(2, 0, 1) / np.float32(255)
-        colors, shown = lane_scores.seen_from(frame.view, rgb, places)
+        colors, shown = street_scores.seen_from(frame.view, rgb, places)
         free = np.asarray(~self._boxes(frame.view))[None].astype(np.float32)
         beside = (geometry.transform_points(view.cam_from_world, places.reshape(-1, 3))[:, 0]).reshape(shown.shape)
         with np.errstate(invalid="ignore"):
-            road = shown & (np.abs(beside) < lane_scores.NTL_BESIDE_M) & ~self._boxes(view)
-        road &= lane_scores.seen_from(frame.view, free, places)[0][0] > 0.99
-        marking = lane_scores.bright_stripes(colors, road)
-        band = lane_scores.lane_band(marking) & road
+            road = shown & (np.abs(beside) < street_scores.NTL_BESIDE_M) & ~self._boxes(view)
+        road &= street_scores.seen_from(frame.view, free, places)[0][0] > 0.99
+        marking = street_scores.bright_stripes(colors, road)
+        band = street_scores.lane_band(marking) & road
         return LaneFacts(road, marking, band, colors.astype(np.float32), exact=False)
 
     def _boxes(self, view: View) -> NDArray[np.bool_]:
@@ -131,9 +130,9 @@ def recorded_truth(scene: Scene, frame: Frame) -> CityTruth:
 def recorded_pair(view: View, seen: CityTruth, world: CityWorld, vehicles: tuple[tuple[int, Track], ...]) -> Pair:
     """A recorded image of a generated city held against the exact truth of its own view."""
     rgb, ids = torch.from_numpy(seen.rgb).permute(2, 0, 1), torch.from_numpy(seen.semantics.astype(np.int64))
-    road = (seen.semantics == ID["road"]) & (seen.depth < lane_scores.LANE_FAR_M)
+    road = (seen.semantics == ID["road"]) & (seen.depth < street_scores.LANE_FAR_M)
     marking = world.markings(view, seen) & road
-    lanes = LaneFacts(road, marking, lane_scores.lane_band(marking), rgb.numpy(), exact=True)
+    lanes = LaneFacts(road, marking, street_scores.lane_band(marking), rgb.numpy(), exact=True)
     facts = ViewFacts(agents=visible_agents(view, vehicles, seen.instance), lanes=lanes)
     return Pair(rgb, None, ids, rgb, None, None, ids, view=view, facts=facts)
 
@@ -144,9 +143,9 @@ def exact_lanes(truth: ViewTruth) -> LaneFacts | None:
     if truth.marking is None or seen.semantics is None or seen.depth is None:
         return None
     depth = seen.depth[0].numpy()
-    road = (seen.semantics.numpy() == ID["road"]) & (depth > 0) & (depth < lane_scores.LANE_FAR_M)
+    road = (seen.semantics.numpy() == ID["road"]) & (depth > 0) & (depth < street_scores.LANE_FAR_M)
     marking = truth.marking & road
-    return LaneFacts(road, marking, lane_scores.lane_band(marking), seen.rgb.numpy(), exact=True)
+    return LaneFacts(road, marking, street_scores.lane_band(marking), seen.rgb.numpy(), exact=True)
 
 
 def known_of(facts: ViewFacts) -> set[str]:

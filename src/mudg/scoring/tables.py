@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from mudg.base import html as tables
+from mudg.base import html
 from mudg.base.errors import plain_lines
 from mudg.base.types import Scene
 from mudg.gaussians.methods import METHODS
@@ -189,7 +189,7 @@ def _mean(values: Sequence[float | str | None]) -> float | str:
 def best_of(better: str, values: Mapping[str, Any], metric: str) -> set[str]:
     """Methods whose shown value is the best one; none when fewer than two have a number."""
     numbers = {m: float(number_text(metric, v)) for m, v in values.items() if isinstance(v, int | float)}
-    return set(tables.best_of(better, numbers))
+    return set(html.best_of(better, numbers))
 
 
 def distance_title(document: Mapping[str, Any], distance_m: float) -> str:
@@ -275,7 +275,7 @@ def markdown(document: Mapping[str, Any]) -> str:
         rows = [[title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in shown)] for r in results]
         lines += ["", f"## {trajectory['name']}", ""]
         if any(isinstance(r["values"].get(n), float) for r in results for n in shown):
-            lines += tables.markdown_table(["method", "views", *shown], rows)
+            lines += html.markdown_table(["method", "views", *shown], rows)
             lines += ["", f"No truth here for {', '.join(unknown)}."] if unknown else []
         else:
             lines.append("Nothing to score against: there is no truth here.")

@@ -23,7 +23,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Frame, Observation, Scene, Sweep, Track, Trajectory, View
 from mudg.city import logs as city_logs
 from mudg.city.world import CityWorld
-from mudg.core import lidar as points_seen
+from mudg.core import lidar
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, largest_beam_gap, separate
 from mudg.core.lidar import OwnedPoints, PointTruth, ShownFrame
 from mudg.core.pictures import resize_nearest, resize_rgb
@@ -213,13 +213,13 @@ class LogPoints:
 
     def placed(self, points: OwnedPoints, time_s: float) -> NDArray[np.float32]:
         """Where points are at a moment, f32[N, 3] in the world; NaN where their object has no box then."""
-        return points_seen.placed(points, self.dynamic, time_s)
+        return lidar.placed(points, self.dynamic, time_s)
 
     def colors(
         self, frame: Frame, points: OwnedPoints, world: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Colours u8[N + 1, 3] that points have in a recorded image, and where it shows them (``points_seen.carried``)."""
-        return points_seen.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
+        return lidar.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
 
     def truth_at(self, view: View, frame: Frame | None) -> PointTruth | None:
         """What the points of the sweeps taken with a view say about it; None without such sweeps.
@@ -231,7 +231,7 @@ class LogPoints:
         if points is None or not len(points.xyz):
             return None
         world = self.placed(points, view.time_s)
-        depth, index = points_seen.visible(view, world, points.gap_deg)
+        depth, index = lidar.visible(view, world, points.gap_deg)
         color, colored = np.zeros((len(world) + 1, 3), np.uint8), np.zeros(len(world) + 1, bool)
         ids = np.append(points.ids, np.uint8(palette.UNLABELLED))
         if frame is not None:
@@ -240,7 +240,7 @@ class LogPoints:
                 label = np.asarray(read_label(self.scene, frame, "semantics"), np.uint8)
                 camera = frame.view.camera
                 label = resize_nearest(label, camera.height, camera.width)
-                values, known = points_seen.carried(frame.view, label, world, points.gap_deg)
+                values, known = lidar.carried(frame.view, label, world, points.gap_deg)
                 ids = np.where(known, values, np.uint8(palette.UNLABELLED))
         dynamic = np.append(points.owner != STATIC, False)[index]
         return PointTruth(depth, dynamic, color[index], colored[index], ids[index])
@@ -278,5 +278,5 @@ def shown_frame(scene: Scene, frame: Frame, rgb: NDArray[np.uint8]) -> ShownFram
         return None
     depth = read_label(scene, frame, "depth")
     return ShownFrame(
-        frame.view, np.where(np.isfinite(depth), depth, np.inf).astype(np.float32), points_seen.blurred(rgb)
+        frame.view, np.where(np.isfinite(depth), depth, np.inf).astype(np.float32), lidar.blurred(rgb)
     )

@@ -35,6 +35,6 @@ class Convert(Step):
     settings: ConvertConfig
 
     def act(self) -> Path:
-        from mudg.steps import conversion as convert
+        from mudg.steps import conversion
 
-        return convert.run(self.settings, self.checkpoint, self.to, overwrite=self.overwrite)
+        return conversion.run(self.settings, self.checkpoint, self.to, overwrite=self.overwrite)

@@ -260,9 +260,9 @@ def _optional() -> dict[str, str]:
         for name, (use, how) in _OPTIONAL.items()
     }
     if _installed("gsplat") and find_spec("torch") is not None:
-        from mudg.core.raster import gsplat_cuda as gsplat_package
+        from mudg.core.raster import gsplat_cuda
 
-        rows["gsplat"] += f"; {gsplat_package.status()}"
+        rows["gsplat"] += f"; {gsplat_cuda.status()}"
     return rows
 
 

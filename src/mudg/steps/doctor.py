@@ -17,6 +17,6 @@ class Doctor(Step):
     """Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this machine)."""
 
     def act(self) -> dict[str, Any]:
-        from mudg.steps import diagnosis as doctor
+        from mudg.steps import diagnosis
 
-        return doctor.report_scene(self.scene) if self.scene is not None else doctor.report_machine()
+        return diagnosis.report_scene(self.scene) if self.scene is not None else diagnosis.report_machine()

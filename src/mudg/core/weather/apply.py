@@ -18,9 +18,7 @@ from mudg.base.weather_settings import (
     SnowSettings,
     WeatherSettings,
 )
-from mudg.core.weather import air as fog
-from mudg.core.weather import air as particles
-from mudg.core.weather import ground
+from mudg.core.weather import air, ground
 from mudg.core.weather import light as relight
 from mudg.core.weather.gbuffer import (
     BufferRules,
@@ -104,9 +102,9 @@ def _air_path(gbuffer: GBuffer, view: View, ground_z_m: float) -> tuple[Array, A
 
 def _without_haze(gbuffer: GBuffer, view: View, visibility_m: float, light: Surroundings) -> tuple[GBuffer, Plane]:
     """Surfaces without the haze of the recording's day; the sky stays. Confidence is what had come through."""
-    share = np.exp(-fog.extinction(visibility_m) * euclidean_range(view, gbuffer.depth))
+    share = np.exp(-air.extinction(visibility_m) * euclidean_range(view, gbuffer.depth))
     sky = gbuffer.sky
-    clear = np.where(sky[..., None], gbuffer.color, fog.unveiled(gbuffer.color, share, light.airlight))
+    clear = np.where(sky[..., None], gbuffer.color, air.unveiled(gbuffer.color, share, light.airlight))
     return replace(gbuffer, color=clear.astype(np.float32)), np.where(sky, 1, share).astype(np.float32)
 
 
@@ -140,34 +138,34 @@ def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: Wea
     distance, rise, height = _air_path(gbuffer, view, light.ground_z_m)
     share = np.ones(distance.shape)
     if weather.fog is not None:
-        share = fog.transmittance(distance, rise, height, weather.fog)
+        share = air.transmittance(distance, rise, height, weather.fog)
     elif weather.recorded_visibility_m > 0:
-        share = np.where(gbuffer.sky, 1.0, np.exp(-fog.extinction(weather.recorded_visibility_m) * distance))
+        share = np.where(gbuffer.sky, 1.0, np.exp(-air.extinction(weather.recorded_visibility_m) * distance))
     falling = FogSettings(top_m=1000.0)  # below the clouds
-    path = fog.optical_depth(distance, rise, height, falling) / fog.extinction(falling.visibility_m)
-    for fall, extinction in ((weather.rain, particles.rain_extinction), (weather.snow, particles.snow_extinction)):
+    path = air.optical_depth(distance, rise, height, falling) / air.extinction(falling.visibility_m)
+    for fall, extinction in ((weather.rain, air.rain_extinction), (weather.snow, air.snow_extinction)):
         if fall is not None and fall.mm_h > 0:  # level rays have no end
             share = share * np.exp(-extinction(fall.mm_h) * np.maximum(path - fall.reach_m, 0))
-    return fog.veiled(gbuffer.color, share, light.airlight), share.astype(np.float32)
+    return air.veiled(gbuffer.color, share, light.airlight), share.astype(np.float32)
 
 
 def _with_particles(
     color: Image, gbuffer: GBuffer, view: View, light: Surroundings, settings: Conditions, seed: int
 ) -> Image:  # fmt: skip
     """Drops and flakes near the camera, one by one."""
-    kinds: list[tuple[RainSettings | SnowSettings, list[particles.ParticleSize], Array, str]] = []
+    kinds: list[tuple[RainSettings | SnowSettings, list[air.ParticleSize], Array, str]] = []
     if settings.weather.rain is not None:
         rain = settings.weather.rain
-        kinds.append((rain, particles.rain_sizes(rain.mm_h), particles.DROP_LIGHT * light.ambient, "rain"))
+        kinds.append((rain, air.rain_sizes(rain.mm_h), air.DROP_LIGHT * light.ambient, "rain"))
     if settings.weather.snow is not None:
         snow = settings.weather.snow
         kinds.append(
-            (snow, particles.snow_sizes(snow.mm_h), ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun), "flakes")
+            (snow, air.snow_sizes(snow.mm_h), ground.SNOW_COLOR * (light.ambient + 0.25 * light.sun), "flakes")
         )
     for fall, sizes, radiance, purpose in kinds:
-        what = particles.Falling(sizes, fall.wind_m_s, fall.reach_m, settings.response.shutter_s, purpose)
-        depth = particles.falling(view, gbuffer.depth, what, gbuffer.camera_velocity, seed)
-        color = fog.veiled(color, np.exp(-depth), radiance)
+        what = air.Falling(sizes, fall.wind_m_s, fall.reach_m, settings.response.shutter_s, purpose)
+        depth = air.falling(view, gbuffer.depth, what, gbuffer.camera_velocity, seed)
+        color = air.veiled(color, np.exp(-depth), radiance)
     return color
 
 

@@ -22,8 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint as shards
-from mudg.base import palette, records, seeds, store
+from mudg.base import checkpoint, palette, records, seeds, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Clip, Condition
 from mudg.core import noise
@@ -593,7 +592,7 @@ def save(
     """
     with store.atomic_directory(folder) as partial:
         small = {"scale": tensors["scale"].float()}
-        files = shards.write_shards(partial, {n: t for n, t in tensors.items() if n != "scale"}, shard_bytes, dtype)
+        files = checkpoint.write_shards(partial, {n: t for n, t in tensors.items() if n != "scale"}, shard_bytes, dtype)
         store.write_safetensors(partial / "scale.safetensors", small)
         files["scale.safetensors"] = store.sha256_file(partial / "scale.safetensors")
         store.write_text(partial / "MODEL_CARD.md", card)
@@ -613,8 +612,8 @@ def load(folder: Path, device: torch.device | str = "cpu", dtype: torch.dtype | 
         raise InputError("not a published-type model of this version", where=where, expected=f"schema 1, kind {KIND}")
     with torch.device("meta"), records.understood("a published-type model", where):
         model = PublishedMDM(records.parse_dataclass(PublishedConfig, content.get("config"), f"{where}: config"))
-    state = shards.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
-    shards.check_fit(state, model.state_dict(), Path(folder))
+    state = checkpoint.read_shards(Path(folder), content["files"], remedy="convert the checkpoint again")
+    checkpoint.check_fit(state, model.state_dict(), Path(folder))
     model.load_state_dict(state, assign=True)
     model.adopt_scale()
     table = model.scale

@@ -19,8 +19,7 @@ from typing import Any, Final, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import log
-from mudg.base import types as checks
+from mudg.base import log, types
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.formats.importers.box_tracks import REACH_S, BoxTimes, clip_track, reach_images, turned_back
@@ -126,7 +125,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
     """
     dataset = content.source.dataset
-    checks.foreign_name(content.name, f"{dataset}: name of the log")
+    types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
     rows: dict[str, list[tuple[int, int, float]]] = {}
     """Sensor -> of each sweep, rows without a return, all rows, and how far apart float32 numbers are at its farthest point."""

@@ -32,8 +32,7 @@ from scipy.spatial import QhullError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint as shards
-from mudg.base import records, seeds, store, weights
+from mudg.base import checkpoint, records, seeds, store, weights
 from mudg.base.config import STRICT
 from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
@@ -177,8 +176,8 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
     with records.understood("a DepthLab model", str(where)):
         made = blank_parts(configs)
     for name, network in made.items():
-        state = shards.read_shards(folder / name, files[name], remedy="convert the published files again")
-        shards.check_fit(state, network.state_dict(), folder / name)
+        state = checkpoint.read_shards(folder / name, files[name], remedy="convert the published files again")
+        checkpoint.check_fit(state, network.state_dict(), folder / name)
         network.load_state_dict({n: value.float() for n, value in state.items()}, assign=True)
         _fill_tables(network, name)
         network.to(device).eval().requires_grad_(False)
@@ -568,7 +567,7 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     }  # fmt: skip
     with store.atomic_directory(to) as partial:
         parts = {
-            part: {"config": configs[part], "files": shards.write_shards(partial / part, found[part], shard_bytes, dtype)}
+            part: {"config": configs[part], "files": checkpoint.write_shards(partial / part, found[part], shard_bytes, dtype)}
             for part in PARTS
         }  # fmt: skip
         store.write_text(partial / "MODEL_CARD.md", _card(facts))
