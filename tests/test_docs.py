@@ -331,8 +331,8 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
         "losses.no_such", "NoSuch(a=1)", "SceneModel.no_such",
     ]  # fmt: skip
     assert not unknown_names("`losses.object_map` `SceneModel.without_nodes` `run.json`")
-    assert unknown_paths("`stages/no_such.py` `no_such.py` `models/no_such/`") == [
-        "stages/no_such.py", "no_such.py", "models/no_such/",
+    assert unknown_paths("`gaussians/no_such.py` `no_such.py` `diffusion/no_such/`") == [
+        "gaussians/no_such.py", "no_such.py", "diffusion/no_such/",
     ]  # fmt: skip
     assert not unknown_paths("`gaussians/fit.py` `src/mudg/app.py` `diffusion/`")
     page = tmp_path / "page.md"

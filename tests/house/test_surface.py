@@ -1,4 +1,4 @@
-"""The public surface is frozen: names in api.json, flags in cli.json. A change is a decision made in the same commit.
+"""What is frozen: public names in api.json, flags in cli.json, lines of each room in budget.json. A change is a decision made in the same commit.
 
 ``MUDG_UPDATE_FROZEN=1 pytest tests/house`` writes the files anew.
 """
@@ -50,6 +50,20 @@ def test_flags_are_frozen() -> None:
         for verb in steps.VERBS
     }
     assert now == frozen("cli.json", now)
+
+
+def test_rooms_keep_their_line_budget() -> None:
+    """budget.json holds the lines of Python that each room may have. Who raises one says why in the message of the same commit."""
+    package = Path(mudg.__file__).parent
+    now = {
+        room.name: sum(path.read_text(encoding="utf-8").count("\n") for path in room.rglob("*.py"))
+        for room in sorted(package.iterdir()) if any(room.glob("*.py"))
+    }  # fmt: skip
+    budget = frozen("budget.json", now)
+    assert isinstance(budget, dict)
+    assert budget.keys() == now.keys()
+    assert not {room: f"{lines} lines, budget {budget[room]}" for room, lines in now.items() if lines > budget[room]}
+    assert not {room: f"{lines} lines, budget {budget[room]}: lower it" for room, lines in now.items() if lines < 0.97 * budget[room]}
 
 
 def is_word(verb: str, name: str) -> bool:
