@@ -21,6 +21,7 @@ from test_report import finished_run
 from mudg.base import checkpoint, store
 from mudg.base.config import result_settings
 from mudg.base.types import FusedCloud, PointCloud
+from mudg.diffusion.published import convert
 from mudg.diffusion.training.score import plot_losses
 from mudg.editing import edit
 from mudg.editing.runs import RunParts
@@ -29,7 +30,7 @@ from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.scoring.detections import read_detections
-from mudg.steps import conversion, pipeline
+from mudg.steps import pipeline
 from mudg.steps.settings.run import RunConfig
 from mudg.viewer import gallery, report
 
@@ -128,7 +129,7 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "times in a report": (functools.partial(scored, name="run.json"), lambda folder: report.write_page(folder, [])),
     "checkpoint": (saved_checkpoint, checkpoint.latest),
     "log of a training": (written("log.jsonl", LOSSES), lambda folder: plot_losses(folder / "log.jsonl", folder / "loss.png")),
-    "model folder": (written("model.json", MODEL), conversion.own_names),
+    "model folder": (written("model.json", MODEL), convert.own_names),
     "boxes": (written("boxes.json", BOXES), lambda folder: read_detections(folder / "boxes.json")),
 }
 

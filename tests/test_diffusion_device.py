@@ -25,6 +25,7 @@ from mudg.core.depth import fit_depth
 from mudg.diffusion import files, learn
 from mudg.diffusion import views as loading
 from mudg.diffusion.model import MDM
+from mudg.diffusion.published import convert
 from mudg.diffusion.published import model as published_files
 from mudg.diffusion.published.model import WorkSplit
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
@@ -43,7 +44,6 @@ from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps import conversion
 from mudg.steps.annotate import Annotate
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn
@@ -212,7 +212,7 @@ def test_a_published_type_model_learns_on_a_device(tmp_path):
     points = write_clips(tmp_path / "clips", 32, 32, points=True)
     torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512.ckpt")
     steady = replace(TINY, net=replace(TINY.net, dropout=0.0))  # dropout draws where it computes
-    conversion.convert_file(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "model", steady)
+    convert.convert_file(ConvertConfig(), tmp_path / "512.ckpt", tmp_path / "model", steady)
     config = published_settings(tmp_path / "model", points, steps=1, batch_frames=4, device="cpu", score_steps=1)
     here = Learn(out=tmp_path / "here", settings=config).run()
     with pretend_device():

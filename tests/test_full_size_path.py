@@ -17,7 +17,7 @@ from mudg.diffusion.published import model as published_files
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings.presets import PRESETS
 
-TOY = "import sys; from toy_published import TINY; from mudg.stages import convert; convert.PublishedConfig = lambda: TINY\n"
+TOY = "import sys; from toy_published import TINY; from mudg.diffusion.published import convert; convert.PublishedConfig = lambda: TINY\n"
 """Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""
 MAIN = "from mudg.app import main; import sys; sys.exit(main(sys.argv[1:]))"
 OWN = {"synthesize.model", "fit.iterations", "fit.virtual.lpips_weights"}

@@ -23,6 +23,7 @@ from mudg.diffusion.clips import shards as clip_shards
 from mudg.diffusion.clips.condition import ConditionRules, build_conditions, filled_depth
 from mudg.diffusion.clips.from_log import LogClipRules, LogSource
 from mudg.diffusion.model import BatchPart, LossSettings
+from mudg.diffusion.published import convert
 from mudg.diffusion.published import model as published_files
 from mudg.diffusion.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
 from mudg.diffusion.settings.learn import LearnConfig
@@ -33,7 +34,6 @@ from mudg.diffusion.views import recorded_images
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps import conversion
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn
 from mudg.steps.synthesize import Synthesize
@@ -90,7 +90,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
         assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
     assert (last.config.width, last.config.height) == (36, 32)
     assert torch.equal(last.schedule.scale, published_files.load(converted).schedule.scale)
-    assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(conversion.LICENCE)
+    assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
     made = read_observations(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import shutil
 from collections.abc import Callable, Iterator
@@ -30,6 +31,7 @@ from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.diffusion import files
 from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.published import convert
 from mudg.diffusion.settings.convert import ConvertConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing.view_settings import RenderConfig, ScoreConfig
@@ -42,7 +44,7 @@ from mudg.networks.codec import CodecConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
-from mudg.steps import conversion, pipeline
+from mudg.steps import pipeline
 from mudg.steps.annotate import Annotate
 from mudg.steps.convert import Convert
 from mudg.steps.fit import Fit
@@ -442,9 +444,10 @@ def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(tmp_path: Path,
 
     def converted(dtype: str, *, overwrite: bool) -> Path:
         config = ConvertConfig(dtype=dtype, resolution="320x512")
-        return conversion.run(config, tmp_path / "512.ckpt", tmp_path / "to", overwrite=overwrite, network=TINY)
+        work = functools.partial(convert.of_diffusion, config, tmp_path / "512.ckpt", network=TINY)
+        return convert.run(config, tmp_path / "512.ckpt", tmp_path / "to", work, overwrite=overwrite)
 
-    monkeypatch.setattr(conversion.processes, "run_limited", lambda work, *_: work() or 0)
+    monkeypatch.setattr(convert.processes, "run_limited", lambda work, *_: work() or 0)
     to = converted("float32", overwrite=False)
     (to / "mine.md").write_text("mine")
     before = tree(to)

@@ -17,6 +17,7 @@ from mudg.base.records import parse_dataclass
 from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
+from mudg.diffusion.published import convert
 from mudg.diffusion.published import model as files
 from mudg.diffusion.published import model as published
 from mudg.diffusion.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
@@ -31,7 +32,6 @@ from mudg.networks import clip
 from mudg.networks.clip import ImageTower, TextTower, TowerConfig
 from mudg.scene.observations import read_observations
 from mudg.scene.settings import FuseConfig
-from mudg.steps import conversion
 from mudg.steps.fuse import Fuse
 from mudg.steps.synthesize import Synthesize
 
@@ -445,7 +445,7 @@ def street(tmp_path_factory):
     ToyStreet(times=[0.1 * n for n in range(6)]).write(root / "scene", width=48, height=32)
     Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
     torch.save({"state_dict": tiny_checkpoint()}, root / "512.ckpt")
-    conversion.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
+    convert.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
     return root
 
 

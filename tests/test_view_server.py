@@ -190,7 +190,7 @@ FEW_FILES = """
 import resource, sys, time
 sys.path.insert(0, {tests!r})
 import test_view_server
-from mudg.stages.viewing import server
+from mudg.viewer import server
 resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
 made = server.open_server(test_view_server.site(), "127.0.0.1", 0)
 print(made.server_address[1], flush=True)

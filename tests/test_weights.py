@@ -17,10 +17,10 @@ from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_chec
 from mudg import app
 from mudg.base import weights
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
+from mudg.diffusion.published import convert
 from mudg.diffusion.published import model as published_files
 from mudg.diffusion.published.model import PublishedConfig
 from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.steps import conversion
 
 CONFIG = ConvertConfig(resolution="320x512")
 ENTER = "model.diffusion_model.input_blocks.0.0.weight"
@@ -51,7 +51,7 @@ def saved(tmp_path, content, name="model.ckpt"):
 
 
 def converted(tmp_path, content, config=CONFIG):
-    conversion.convert_file(config, saved(tmp_path, content), tmp_path / "out", TINY)
+    convert.convert_file(config, saved(tmp_path, content), tmp_path / "out", TINY)
     return published_files.load(tmp_path / "out")
 
 
@@ -61,7 +61,7 @@ def converted(tmp_path, content, config=CONFIG):
 @pytest.fixture(scope="module")
 def wanted():
     """Names and shapes of the full-size network."""
-    return conversion.wanted_shapes(PublishedConfig())
+    return convert.wanted_shapes(PublishedConfig())
 
 
 def test_every_published_tensor_is_accounted_for(published_keys, wanted):
@@ -215,7 +215,7 @@ def test_the_files_rescale_wins(tmp_path):
 
 
 def test_rescale_stays_exact_in_half_precision(tmp_path, complete, monkeypatch):
-    monkeypatch.setattr(conversion, "SHARD_BYTES", 1 << 20)
+    monkeypatch.setattr(convert, "SHARD_BYTES", 1 << 20)
     model = converted(tmp_path, {"state_dict": complete}, ConvertConfig(resolution="320x512", dtype="bfloat16"))
     assert model.dtype == torch.bfloat16
     assert torch.equal(model.schedule.scale, scale_table()[:1000])
@@ -281,8 +281,8 @@ def test_towers_can_come_from_another_file(tmp_path, whole, complete):
     towers = {n.removeprefix(p): v for p in prefixes for n, v in complete.items() if n.startswith(p)}
     path = saved(tmp_path, towers, "towers.pt")
     with pytest.raises(InputError, match="missing"):
-        conversion.convert_file(CONFIG, saved(tmp_path, without), tmp_path / "b", TINY)
-    conversion.convert_file(
+        convert.convert_file(CONFIG, saved(tmp_path, without), tmp_path / "b", TINY)
+    convert.convert_file(
         ConvertConfig(resolution="320x512", towers=str(path)), saved(tmp_path, without), tmp_path / "b", TINY
     )
     joined, plain = published_files.load(tmp_path / "b").state_dict(), published_files.load(whole).state_dict()
@@ -293,13 +293,13 @@ def test_towers_can_come_from_another_file(tmp_path, whole, complete):
 def test_conversion_in_its_own_process(tmp_path, complete):
     """The way of the command line: a fresh process with a memory limit."""
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
-    assert conversion.run(ConvertConfig(), path, tmp_path / "model", network=TINY) == tmp_path / "model"
+    assert convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY) == tmp_path / "model"
     assert published_files.load(tmp_path / "model").config.height == 320
     with pytest.raises(UsageError, match="exists"):
-        conversion.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
+        convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
     (tmp_path / "photos").mkdir()
     with pytest.raises(UsageError, match="do not belong to a model"):
-        conversion.run(ConvertConfig(), path, tmp_path / "photos", overwrite=True, network=TINY)
+        convert.run(ConvertConfig(), path, tmp_path / "photos", overwrite=True, network=TINY)
 
 
 @pytest.mark.slow
@@ -307,7 +307,7 @@ def test_errors_come_back_from_the_process(tmp_path, complete):
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(InputError, match="not a readable checkpoint"):
-        conversion.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
+        convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
     assert not (tmp_path / "model").exists()
 
 
@@ -316,7 +316,7 @@ def test_errors_come_back_from_the_process(tmp_path, complete):
 def test_the_memory_limit_holds(tmp_path, complete):
     path = saved(tmp_path, {"state_dict": {**complete, "big": torch.zeros(64_000_000)}}, "512.ckpt")
     with pytest.raises(ResourceError, match="memory"):
-        conversion.run(ConvertConfig(memory_gb=0.1), path, tmp_path / "model", network=TINY)
+        convert.run(ConvertConfig(memory_gb=0.1), path, tmp_path / "model", network=TINY)
     assert not (tmp_path / "model").exists()
 
 
@@ -334,11 +334,11 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
 
 
 def test_resolution_is_told_by_the_name_or_asked_for(tmp_path):
-    assert conversion.resolution(ConvertConfig(), Path("1024-mdm-checkpoint.ckpt")) == (576, 1024)
-    assert conversion.resolution(ConvertConfig(), Path("DynamiCrafter_512/model.ckpt")) == (320, 512)
-    assert conversion.resolution(CONFIG, Path("x/1024.ckpt")) == (320, 512)
+    assert convert.resolution(ConvertConfig(), Path("1024-mdm-checkpoint.ckpt")) == (576, 1024)
+    assert convert.resolution(ConvertConfig(), Path("DynamiCrafter_512/model.ckpt")) == (320, 512)
+    assert convert.resolution(CONFIG, Path("x/1024.ckpt")) == (320, 512)
     with pytest.raises(UsageError, match="--resolution"):
-        conversion.resolution(ConvertConfig(), Path("x/model.ckpt"))
+        convert.resolution(ConvertConfig(), Path("x/model.ckpt"))
 
 
 def test_altered_model_folders_are_refused(tmp_path, whole):

@@ -8,13 +8,13 @@ from toy_clips import with_settings
 
 from mudg.base import weights
 from mudg.core.noise import ScheduleConfig
+from mudg.diffusion.published import convert
 from mudg.diffusion.published.kl_vae import AutoencoderConfig
 from mudg.diffusion.published.model import PublishedConfig, PublishedMDM
 from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
 from mudg.diffusion.settings.convert import ConvertConfig
 from mudg.diffusion.settings.learn import LearnConfig
 from mudg.networks.clip import TowerConfig
-from mudg.steps import conversion
 
 TINY = PublishedConfig(
     net=VideoUNetConfig(
@@ -69,7 +69,7 @@ def scale_table(base=0.7):
 
 def tiny_checkpoint(base=0.7):
     """Published name -> tensor of a complete checkpoint of the tiny network, with the tables that real ones carry."""
-    shapes = conversion.wanted_shapes(TINY)
+    shapes = convert.wanted_shapes(TINY)
     published = weights.published_names(shapes)
     state = {theirs: value_for(theirs, shapes[ours]) for ours, theirs in published.items()}
     state["scale_arr"] = scale_table(base)
@@ -111,5 +111,5 @@ def published_settings(start, clips, **changes):
 def write_tiny(folder):
     """The tiny model as `convert` writes it."""
     torch.save({"state_dict": tiny_checkpoint()}, folder / "512.ckpt")
-    conversion.convert_file(ConvertConfig(), folder / "512.ckpt", folder / "model", TINY)
+    convert.convert_file(ConvertConfig(), folder / "512.ckpt", folder / "model", TINY)
     return folder / "model"

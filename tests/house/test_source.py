@@ -27,7 +27,7 @@ TORCH_FREE = (
     "__init__.py", "__main__.py", "app.py", "steps/*.py", "steps/settings/*.py", "*/settings.py", "*/settings/*.py", "*/*_settings.py",
     "gaussians/methods.py", "fleet/verbs.py", "benchmarks/verb.py", "base/*.py",
 )  # fmt: skip
-TORCH_ALLOWED = ("base/checkpoint.py", "base/weights.py", "steps/conversion.py")
+TORCH_ALLOWED = ("base/checkpoint.py", "base/weights.py")
 
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "random", "torchvision"}
 LITERAL_TABLES = ("__init__.py", "steps/__init__.py", "steps/settings/__init__.py", "gaussians/model.py", "gaussians/recipes.py")

@@ -1,4 +1,4 @@
-"""What is frozen: public names in api.json, flags in cli.json, lines of each room in budget.json. A change is a decision made in the same commit.
+"""What is frozen: public names in api.json, flags in cli.json, lines of each room in budget.json. A change is a decision of its commit.
 
 ``MUDG_UPDATE_FROZEN=1 pytest tests/house`` writes the files anew.
 """

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from mudg.base.errors import InputError, UsageError
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
@@ -35,6 +38,31 @@ class Convert(Step):
     settings: ConvertConfig
 
     def act(self) -> Path:
-        from mudg.steps import conversion
+        from mudg.diffusion.published import convert
 
-        return conversion.run(self.settings, self.checkpoint, self.to, overwrite=self.overwrite)
+        return convert.run(self.settings, self.checkpoint, self.to, self._conversion, overwrite=self.overwrite)
+
+    def _conversion(self, to: Path) -> tuple[Callable[[], None], int]:
+        """What converts this checkpoint to a folder, and the address space that it may take."""
+        from mudg.diffusion.published import convert
+        from mudg.labels.depth import depthlab
+        from mudg.scoring.converted import convert_weights
+
+        config, source = self.settings, self.checkpoint
+        if config.network != "diffusion":
+            if config.resolution != "auto" or config.towers or config.dtype != "keep":
+                raise UsageError(
+                    "--resolution, --towers and --dtype apply to diffusion models only", where=f"--network {config.network}"
+                )
+            if not source.is_file():
+                raise InputError("no such checkpoint", where=str(source))
+            # read, and converted to float32
+            return functools.partial(convert_weights, config.network, source, to), convert.memory_limit(config, source, source)
+        if not source.is_dir():
+            return convert.of_diffusion(config, source, to)
+        if config.resolution != "auto" or config.towers:
+            raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(source),
+                             remedy="leave them out, or give a checkpoint file")  # fmt: skip
+        files = depthlab.find(source).files()
+        work = functools.partial(depthlab.convert_folder, source, to, convert.DTYPES[config.dtype], convert.SHARD_BYTES)
+        return work, convert.memory_limit(config, *files)

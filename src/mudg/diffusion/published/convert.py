@@ -1,5 +1,4 @@
-"""convert: a published checkpoint -> a model folder that `synthesize` and training read; or DepthLab's (`labels/depth/depthlab.py`),
-or a network of the scores (`scoring/converted.py`).
+"""convert: a published checkpoint -> a model folder that `synthesize` and training read.
 
 The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
 unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
@@ -25,10 +24,8 @@ from mudg.base.run_folder import Replacement, all_names, refuse_overlap
 from mudg.diffusion.published import model as published_files
 from mudg.diffusion.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
 from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.labels.depth import depthlab
 from mudg.networks import clip
 from mudg.networks.clip import TextTower
-from mudg.scoring.converted import convert_weights
 
 _UNET = "model.diffusion_model."
 _ENTER = _UNET + "input_blocks.0.0.weight"
@@ -42,15 +39,18 @@ LICENCE = (
 )
 
 
-def run(
-    config: ConvertConfig, checkpoint: Path, to: Path, *, overwrite: bool = False, network: PublishedConfig | None = None
-) -> Path:
+Work = Callable[[], None]
+Conversion = Callable[[Path], tuple[Work, int]]
+"""A folder to write -> what writes a model there, and the address space that it may take."""
+
+
+def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversion, *, overwrite: bool = False) -> Path:
     """Convert one checkpoint; returns `to`, which is complete or not there.
 
     Args:
         config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
         to: folder of the model; replaced only with `overwrite`.
-        network: sizes of the network the checkpoint should hold (None: the published ones).
+        conversion: of this kind of checkpoint.
 
     Raises:
         UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is written.
@@ -66,12 +66,7 @@ def run(
     if replaces and not _holds_model(to):
         raise UsageError("the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to")
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
-    if config.network != "diffusion":
-        work, limit = _of_scores(config, checkpoint, place)
-    elif checkpoint.is_dir():
-        work, limit = _from_folder(config, checkpoint, place)
-    else:
-        work, limit = _from_file(config, checkpoint, place, network)
+    work, limit = conversion(place)
     if replaces:
         replacement.begin()
     try:
@@ -105,37 +100,18 @@ def own_names(folder: Path) -> list[str]:
         return []
 
 
-Work = Callable[[], None]
+def of_diffusion(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None = None) -> tuple[Work, int]:
+    """The conversion of a diffusion model, and the address space it may take.
 
-
-def _from_file(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None) -> tuple[Work, int]:
-    """The conversion of a checkpoint, and the address space it may take."""
+    Args:
+        network: sizes of the network the checkpoint should hold (None: the published ones).
+    """
     if not checkpoint.is_file():
         raise InputError("no such checkpoint", where=str(checkpoint))
     height, width = resolution(config, checkpoint)
     network = replace(network or PublishedConfig(), height=height, width=width)
     towers = [Path(config.towers)] if config.towers and Path(config.towers).is_file() else []
     return functools.partial(convert_file, config, checkpoint, to, network), memory_limit(config, checkpoint, *towers)
-
-
-def _of_scores(config: ConvertConfig, checkpoint: Path, to: Path) -> tuple[Work, int]:
-    """The conversion of a network of the scores, and the address space it may take."""
-    if config.resolution != "auto" or config.towers or config.dtype != "keep":
-        raise UsageError("--resolution, --towers and --dtype apply to diffusion models only", where=f"--network {config.network}")
-    if not checkpoint.is_file():
-        raise InputError("no such checkpoint", where=str(checkpoint))
-    limit = memory_limit(config, checkpoint, checkpoint)  # read, and converted to float32
-    return functools.partial(convert_weights, config.network, checkpoint, to), limit
-
-
-def _from_folder(config: ConvertConfig, folder: Path, to: Path) -> tuple[Work, int]:
-    """The conversion of DepthLab's files, and the address space it may take."""
-    if config.resolution != "auto" or config.towers:
-        raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(folder),
-                         remedy="leave them out, or give a checkpoint file")  # fmt: skip
-    files = depthlab.find(folder).files()
-    dtype = DTYPES[config.dtype]
-    return functools.partial(depthlab.convert_folder, folder, to, dtype, SHARD_BYTES), memory_limit(config, *files)
 
 
 def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
