@@ -27,6 +27,7 @@ from mudg.base import log, memory, store
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.records import understood
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Condition, FusedCloud, Photo, Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
@@ -88,7 +89,7 @@ def read_drive(config: SynthesizeConfig, given: JobInputs) -> Scene:
     return loaded if given.script is None else _edited(config, given, given.script, loaded).scene
 
 
-def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: Path) -> dict[str, Any]:
+def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:
     """Generate all trajectories of the configuration, one folder of observations each; returns a summary.
 
     Raises:
@@ -109,7 +110,7 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: 
     processes = config.processes or usual_processes(config, paths)
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
     try:
-        frames = _run_jobs([(config, given, out, path, model) for path in paths], names, processes)
+        frames = _run_jobs([(config, given, work.path, path, model) for path in paths], names, processes)
     finally:
         _drive_again.cache_clear()
     seconds = time.monotonic() - started

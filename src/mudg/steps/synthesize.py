@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.steps.engine import script_of
@@ -12,8 +13,8 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
     from mudg.diffusion.settings.synthesize import SynthesizeConfig
+    from mudg.steps.engine import Make
 
 
 class Synthesize(Output):
@@ -23,7 +24,9 @@ class Synthesize(Output):
     examples = ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",)
     smaller = "one process (--processes 1), smaller views (--width-px), fewer --cameras and --shifts-m"
     result = "views"
+    from_run = ("fused",)
     version, files = 2, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
+    idle = ("offload", "compiled")
     short = (
         "model",
         "cameras",
@@ -49,15 +52,12 @@ class Synthesize(Output):
     """Edit script (docs/edit.md): make views of the drive as it says."""
     settings: SynthesizeConfig
 
-    def required(self) -> tuple[str, ...]:
-        return ("fused",)
-
     def checked(self) -> Self:
         from mudg.diffusion import views as loading
         from mudg.steps import synthesis as synthesize
 
-        renders = self.fitted is not None
-        weather = self.edits is not None and synthesize.shows_weather(self.settings, script_of(self.edits)[0], renders)
+        script, renders = script_of(self.edits), self.fitted is not None
+        weather = script is not None and synthesize.shows_weather(self.settings, script, renders)
         return replace(self, settings=loading.check_config(self.settings, renders, weather=weather))
 
     def reads(self) -> dict[str, Path | str | None]:
@@ -71,18 +71,8 @@ class Synthesize(Output):
         first = self.digests({"scene": self.scene, "fused": self.fused})
         return first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
 
-    def key_settings(self) -> dict[str, Any]:
-        """Without those that say how is computed, not what: a result may be resumed and reused under others."""
-        return {name: value for name, value in super().key_settings().items() if name not in ("offload", "compiled")}
-
-    def prepare(self, inputs: dict[str, str]) -> Any:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.steps import synthesis as synthesize
 
-        script = None if self.edits is None else script_of(self.edits)[0]
-        given = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script)
-        return given, synthesize.read_drive(self.settings, given)
-
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.steps import synthesis as synthesize
-
-        return synthesize.write_views(self.settings, *prepared, work.path)
+        given = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script_of(self.edits))
+        return partial(synthesize.write_views, self.settings, given, synthesize.read_drive(self.settings, given))

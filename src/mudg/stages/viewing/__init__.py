@@ -1,1 +1,0 @@
-"""Parts of ``mudg view``: the server on this machine and the exact frames behind it."""
