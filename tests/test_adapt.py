@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import random
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from faults import contents
 from fit_settings import fit_config
 from pretend_device import pretend_device
 
@@ -27,7 +37,7 @@ from mudg.formats.settings import IngestConfig
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_image, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.adapt import Adapt
+from mudg.steps.adapt import Adapt, fit_scene
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
@@ -130,7 +140,7 @@ def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp
     model = files.load(config.model)
     learnt, lessons = adapt._open_log(config, model, log / "scene", log / "fuse", log / "fit")
     lesson = lessons[0]
-    folder = adapt_lessons.fit_lesson(config, learnt, lesson, tmp_path / lesson.name)
+    folder = adapt_lessons.fit_lesson(config, learnt, lesson, tmp_path / lesson.name, fit_scene)
     clip = adapt_clips.ClipMaker(config, learnt, lesson, model, folder).make(lesson.truth[0][1], 0)
     scene = read_scene(log / "scene")
     photo = read_image(scene, next(f for f in scene.frames if f.id == lesson.truth[0][1][0]))
@@ -203,6 +213,84 @@ def test_an_interrupted_adaptation_continues_to_the_same_model(log, result, tmp_
     monkeypatch.setattr(adapt_clips, "write_shard", write)
     again = adapted(log, tmp_path / "out")
     assert weights_of(again) == weights_of(result / "model")
+
+
+@pytest.fixture(scope="module")
+def short_log(tmp_path_factory):
+    """The least that a model can be adapted to: six small frames."""
+    root, size = tmp_path_factory.mktemp("short"), (64, 48)
+    city = CityConfig(seed=5, n_frames=6, width=size[0], height=size[1], cameras=("front",), lidar_azimuth_step_deg=1.2)
+    Ingest(log="city", out=root / "scene", settings=IngestConfig(city=city, test_every=0, contact_sheet=False)).run()
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
+    few = fit_config(method="street_gaussians", iterations=4, start__gaussians=1000)
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=few).run()
+    before = files.load("embedded-tiny")
+    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=size[0] * size[1])
+    files.save(extended(before, grown), root / "tiny", "", {})
+    return root
+
+
+COMMANDS = """
+import json, os, signal, sys
+import test_adapt  # all that the commands need is loaded once: they are copies of this process
+from mudg import app
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a script starts in the background
+        os._exit(app.main(json.loads(line)))
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@contextlib.contextmanager
+def commands(log):
+    """Runs ``mudg adapt`` with one thread into a folder, and sends it a signal after some seconds of work; gives the exit status."""
+    environment = {**os.environ, "MUDG_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+    words = ["adapt", log / "scene", "--fused", log / "fuse", "--fitted", log / "fit", "--model", log / "tiny", "--shifts-m", "1", "-1",
+             "--no-gaps", "--block", "1", "--held-out-every", "3", "--fit-iterations", "4", "--steps", "4", "--batch-frames", "2",
+             "--precision", "float32", "--out"]  # fmt: skip
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMANDS], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    ) as server:
+
+        def command(out, processes=1, sent=None, after_s=0.0):
+            print(json.dumps([*map(str, words), str(out), "--processes", str(processes)]), file=server.stdin, flush=True)
+            child = int(server.stdout.readline())
+            if sent is not None:
+                while not out.exists():
+                    time.sleep(0.01)
+                time.sleep(after_s)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(child, sent)
+            return int(next(line for line in server.stdout if line.strip().lstrip("-").isdigit()))  # behind what the command prints
+
+        yield command
+        server.stdin.close()
+
+
+@pytest.mark.slow
+def test_an_adaptation_stopped_at_random_moments_is_repeated_to_the_same_files(short_log, tmp_path):
+    """Ctrl-C, SIGTERM and SIGKILL, the last with worker processes, which outlive their parent for a moment."""
+    rng, stopped = random.Random(33), 0
+    with commands(short_log) as command:
+        since = time.monotonic()
+        assert command(tmp_path / "whole") == 0
+        took_s, whole = time.monotonic() - since, contents(tmp_path / "whole")
+        assert {"adapt.json", "before.png", "model/model.json", "manifest.json"} <= whole.keys()
+        for number, (sent, code) in enumerate([(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)] * 2):
+            out, after_s = tmp_path / f"stopped{number}", rng.uniform(0, 0.9) * took_s
+            status = command(out, 2 if sent == signal.SIGKILL else 1, sent, after_s)
+            place = f"{sent.name} after {after_s:.2f} of {took_s:.2f} s: status {status}"
+            assert status in (0, code), place
+            stopped += status != 0
+            assert command(out) == 0, place
+            found = contents(out)
+            assert found.keys() == whole.keys(), place
+            assert [name for name in found if found[name] != whole[name] and name != "manifest.json"] == [], place
+            store.verify_manifest(out)
+    assert stopped >= 4
 
 
 def test_what_cannot_be_adapted_is_refused(log, tmp_path):

@@ -458,7 +458,7 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
     job.write_seen(scene, places.held_out(scene, SPLITS["all"], ()))
     chain = job.chain()
     monkeypatch.setattr(Chain, "first", lambda _: tmp_path / "first")
-    monkeypatch.setattr(real.adapt, "run", lambda *_, **__: job.folder / "adapt" / "model")
+    monkeypatch.setattr(real.Adapt, "run", lambda _: job.folder / "adapt" / "model")
     numbers = {"before": {"psnr": 20.0}, "after": {"psnr": 21.0}}
     for helped, sees in ((True, "adapted"), (False, "renders")):
         store.write_json(job.folder / "adapt" / "adapt.json", {"adapted": helped, **numbers})
@@ -469,7 +469,7 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
     def fail(*_, **__):
         raise InputError("the log is too short to adapt to", got="1 clip")
 
-    monkeypatch.setattr(real.adapt, "run", fail)
+    monkeypatch.setattr(real.Adapt, "run", fail)
     use = job.use("adapted", chain)
     assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
     plain = str(tmp_path / "plain")

@@ -8,20 +8,18 @@ from typing import ClassVar
 
 import pytest
 import yaml
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from mudg.base import config
 from mudg.base.errors import InputError, UsageError
 from mudg.editing.view_settings import RenderConfig
 
 
-@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+@config.settings
 class Inner:
-    iterations: int = Field(default=10, ge=1)
+    iterations: int = config.setting(default=10, ge=1)
 
 
-@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+@config.settings
 class Outer:
     seed: int = 0
     inner: Inner = Inner()
@@ -73,22 +71,22 @@ def test_configurations_are_frozen() -> None:
         Outer().seed = 3  # type: ignore[misc]
 
 
-@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+@config.settings
 class Wheels:
     kind: str = "steel"
     count: int = 4
 
 
-@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+@config.settings
 class Cart:
     RETIRED: ClassVar = {"horn": ("wheels", False), "bells": ("", [1, 2])}
-    wheels: Wheels = Field(default_factory=Wheels)
+    wheels: Wheels = config.setting(default_factory=Wheels)
     seats: int = 2
 
 
-@dataclass(frozen=True, kw_only=True, config=config.STRICT)
+@config.settings
 class Fleet:
-    cart: Cart = Field(default_factory=Cart)
+    cart: Cart = config.setting(default_factory=Cart)
 
 
 def test_settings_that_were_taken_out_stay_in_keys_and_files_with_their_one_value(tmp_path):

@@ -109,7 +109,7 @@ def test_words_that_make_no_sense(words: list[str], out: str | None, expected: s
     with pytest.raises(UsageError, match="--format was given twice"):
         app.parse(["ingest", "custom", "log", "o", "--format", "kitti"])
     with pytest.raises(UsageError, match="no such format") as caught:
-        Ingest(log="log", out=Path("o"), settings=IngestConfig(format="rosbag")).run()
+        Ingest(log=".", out=Path("o"), settings=IngestConfig(format="rosbag")).run()
     assert "kitti" in caught.value.expected
 
 

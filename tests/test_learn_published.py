@@ -206,6 +206,19 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
     assert (changed != loss) == matters
 
 
+def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted, clips):
+    settings = published_settings(converted, clips)
+    model, _ = learn_models.starting_model(settings)
+    (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
+    with torch.no_grad():
+        losses = {
+            (share, frame): float(model([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, share, frame_dropout=frame)).total)
+            for share in (0.0, 1.0)
+            for frame in (False, True)
+        }
+    assert losses[0.0, False] == losses[0.0, True] and losses[1.0, False] != losses[1.0, True]
+
+
 def test_the_scope_of_reference_dropout_reaches_the_loss():
     rules = [
         learn._loss_settings(with_settings(LearnConfig(), **given), torch.ones(19))

@@ -14,6 +14,7 @@ import toy_views
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
+from mudg.core.metrics import METRICS
 from mudg.core.pictures import resize_nearest
 from mudg.editing.view_settings import ScoreConfig
 from mudg.networks import featnets
@@ -235,6 +236,8 @@ def test_distances_average_both_sides_and_mark_the_best() -> None:
     assert score_tables.best_of("higher", {"a": 1.0, "b": 2.0, "c": "not computed"}, "psnr") == {"b"}
     assert score_tables.best_of("lower", {"a": 0.1001, "b": 0.1004}, "abs_rel") == {"a", "b"}  # equal as shown
     assert score_tables.best_of("lower", {"a": 0.1}, "abs_rel") == set()
+    flicker = {"steadier than the truth": 0.4, "near it": 0.9, "restless": 1.3}
+    assert score_tables.best_of(METRICS["flicker"].better, flicker, "flicker") == {"near it"}
 
 
 def test_baseline_fills_holes_with_the_nearest_point(scene: Path) -> None:

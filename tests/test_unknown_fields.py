@@ -114,8 +114,8 @@ def to_boxes_of_dgp(root: Path, names: Sequence[str]) -> None:
 
 def to_clouds(root: Path, names: Sequence[str]) -> None:
     for path in root.rglob("lidar/**/*.npz"):
-        arrays = dict(np.load(path))
-        np.savez(path, **arrays, **{name: np.zeros(len(arrays["xyz"])) for name in names})
+        arrays: dict[str, Any] = dict(np.load(path))
+        np.savez(path, **{**arrays, **dict.fromkeys(names, np.zeros(len(arrays["xyz"])))})  # pyright: ignore[reportArgumentType]
 
 
 CASES: dict[str, tuple[Adder, Sequence[str], str, str]] = {
@@ -178,7 +178,7 @@ def test_each_kind_of_file_has_its_line_also_where_the_import_fails(
     root, options = copied
     to_rows(root, ["foo"], "sample_data")
     to_rows(root, ["translatoin"], "ego_pose")
-    write_nuscenes.edit(root, "ego_pose", lambda rows: [row.pop("translation") for row in rows])
+    write_nuscenes.edit(root, "ego_pose", lambda rows: rows[0].pop("translation"))
     with pytest.raises(InputError, match="'translation' is missing"):
         bad_logs.ingest("nuscenes", root, tmp_path / "out", options)
     assert said(capsys) == [

@@ -44,6 +44,19 @@ for arguments in {commands!r}:
     assert done.returncode == 0, done.stderr
 
 
+def test_help_checks_no_setting() -> None:
+    """Checking needs pydantic, which takes longer to import than all else that a page of help needs."""
+    code = """
+import sys
+from mudg import app, steps
+for verb in steps.VERBS:
+    assert app.main([*verb.split(), "--help-all"]) == 0
+    assert "pydantic" not in sys.modules, verb
+"""
+    done = fresh(code)
+    assert done.returncode == 0, done.stderr
+
+
 def best_of(count: int, command: list[str]) -> float:
     """Least processor time of several runs: what the program costs, not what else the machine does meanwhile."""
     times = []
@@ -72,9 +85,9 @@ def library_s() -> float:
     ],
     ids=" ".join,
 )
-def test_starting_takes_less_than_half_a_second(arguments: list[str], library_s: float) -> None:
+def test_starting_takes_a_third_of_a_second(arguments: list[str], library_s: float) -> None:
     """On a machine that is slow just now: less than six times what Python takes to import a piece of its own library."""
-    allowed_s = max(0.45, 6 * library_s) * float(os.environ.get("MUDG_SLOW_MACHINE", "1"))
+    allowed_s = max(0.35, 6 * library_s) * float(os.environ.get("MUDG_SLOW_MACHINE", "1"))
     assert best_of(3, [sys.executable, *arguments]) < allowed_s
 
 

@@ -8,38 +8,94 @@ those of its fields that are no settings: they have their defaults, as if they w
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from typing import TYPE_CHECKING, Any, Final, TypeVar, dataclass_transform
 
 from mudg.base.errors import InputError, UsageError, nearest
-from mudg.base.records import first_problem
+
+if TYPE_CHECKING:
+    from pydantic import ConfigDict, GetCoreSchemaHandler, TypeAdapter
+    from pydantic_core import CoreSchema
 
 Config = TypeVar("Config")
 
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
-"""Pass as ``@pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=STRICT)``.
+STRICT: Final[ConfigDict] = {"extra": "forbid", "allow_inf_nan": False}
+"""For pydantic: unknown names are refused, and numbers that are NaN or infinite."""
 
-No number may be NaN or infinite. Validators are built at their first use: a command builds only those of its own verb. A
-default that is itself a configuration is therefore a ``default_factory``."""
+
+def setting(*, default: Any = dataclasses.MISSING, default_factory: Any = dataclasses.MISSING, **limits: Any) -> Any:
+    """A field of ``settings`` with a default and limits, as ``ge=0``."""
+    return dataclasses.field(default=default, default_factory=default_factory, metadata=limits)
+
+
+class Limits:
+    """Limits inside of the type of a setting: ``tuple[Annotated[int, Limits(ge=1)], ...]``."""
+
+    def __init__(self, **limits: Any) -> None:
+        self.limits = limits
+
+    def __repr__(self) -> str:
+        return f"Limits({', '.join(f'{name}={value!r}' for name, value in self.limits.items())})"
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return {**handler(source), **self.limits}  # type: ignore[return-value]
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(setting,))
+def settings(cls: type[Config]) -> type[Config]:
+    """Make a class a frozen dataclass whose values pydantic checks, all but those of ``Class()`` and of ``changed``.
+
+    pydantic is imported at the first check: help, which shows defaults and presets, does without. A default that is itself a
+    configuration is a ``default_factory``.
+    """
+    made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    with_defaults: Callable[[Any], None] = made.__init__
+
+    @functools.wraps(with_defaults)
+    def checked(self: Any, *args: Any, **values: Any) -> None:
+        if not args and not values:
+            with_defaults(self)
+            return
+        from pydantic_core import ArgsKwargs
+
+        _adapter(type(self)).validator.validate_python(ArgsKwargs(args, values), self_instance=self)
+
+    made.__init__, made.__pydantic_config__ = checked, STRICT
+    return made
+
+
+@functools.cache
+def _adapter(config_type: type[Config]) -> TypeAdapter[Config]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(config_type)
+
+
+def changed(config: Config, values: Mapping[str, Any]) -> Config:
+    """A configuration with other values, which are those of this program and are not checked."""
+    other = copy.copy(config)
+    vars(other).update(values)
+    return other
 
 
 def to_dict(config: Any) -> dict[str, Any]:
     """A configuration as plain JSON values, in the order of its settings, those of ``RETIRED`` included."""
-    return _with_retired(config, TypeAdapter(type(config)).dump_python(config, mode="json"))
-
-
-def _with_retired(config: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     retired, whole = getattr(config, "RETIRED", {}), dict[str, Any]()
-    for name, value in values.items():
-        whole |= {old: former for old, (follower, former) in retired.items() if follower == name}
-        part = getattr(config, name)
-        whole[name] = _with_retired(part, value) if dataclasses.is_dataclass(part) else value
+    for field in dataclasses.fields(config):
+        whole |= {old: former for old, (follower, former) in retired.items() if follower == field.name}
+        whole[field.name] = _plain(getattr(config, field.name))
     return whole | {old: former for old, (follower, former) in retired.items() if not follower}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return to_dict(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
 def _without_retired(
@@ -96,15 +152,22 @@ def load(
         UsageError: unknown key (the nearest name is suggested), wrong type or value out of range.
         InputError: the YAML file is missing or malformed.
     """
-    values = _without_retired(config_type, to_dict(preset if preset is not None else config_type()), "preset")
+    usual = config_type() if preset is None else preset
+    if yaml_path is None and not overrides:
+        return usual
+    values = _without_retired(config_type, to_dict(usual), "preset")
     if yaml_path is not None:
         content = _read_yaml(yaml_path)
         content.pop("verb", None)
         values = _merge(values, _without_retired(config_type, content, str(yaml_path)), str(yaml_path), config_type)
     if overrides:
         values = _merge(values, _without_retired(config_type, overrides, "flags"), "flags", config_type)
+    from pydantic import ValidationError
+
+    from mudg.base.records import first_problem
+
     try:
-        return TypeAdapter(config_type).validate_python(values)
+        return _adapter(config_type).validate_python(values)
     except ValidationError as error:
         path = [str(part) for part in error.errors(include_url=False)[0]["loc"]]
         problem = first_problem(error, f"{yaml_path or 'configuration'}: ", UsageError)
@@ -141,8 +204,12 @@ def nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
 
 def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> Config:
     """Validate plain values as a ``config_type``; UsageError names the first wrong field."""
+    from pydantic import ValidationError
+
+    from mudg.base.records import first_problem
+
     try:
-        return TypeAdapter(config_type).validate_python(_without_retired(config_type, values, where))
+        return _adapter(config_type).validate_python(_without_retired(config_type, values, where))
     except ValidationError as error:
         raise first_problem(error, f"{where}: ", UsageError) from error
 

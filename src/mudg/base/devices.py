@@ -15,16 +15,15 @@ import re
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Annotated, Final
 
-from pydantic import StringConstraints
-
 from mudg.base import log
+from mudg.base.config import Limits
 from mudg.base.errors import ResourceError, UsageError
 
 if TYPE_CHECKING:
     import torch
 
 DevicePattern: Final = r"^(auto|[a-z]+(:\d+)?)$"
-DeviceName = Annotated[str, StringConstraints(pattern=DevicePattern)]
+DeviceName = Annotated[str, Limits(pattern=DevicePattern)]
 """A setting's type: `auto`, or a kind of device with or without its number."""
 REMEDY: Final = "--device cpu works everywhere; `mudg doctor` lists the devices of this machine"
 

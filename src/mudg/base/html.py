@@ -20,6 +20,9 @@ from mudg.base import palette
 
 PUBLISHED: Final = "published"
 """Kind of the lines that LaTeX sets apart from the others by a rule."""
+ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
+SENSES: Final = {"higher": "higher is better", "lower": "lower is better", "one": "nearest to 1 is best"}
+"""Which way the numbers of a column are better, as a sign and in words."""
 _LATEX: Final = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$",
@@ -151,5 +154,6 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals |= {"arrows": ARROWS, "senses": SENSES}
     environment.globals["tone"] = lambda method: method if method in TONES else "soft"
     return environment

@@ -587,6 +587,14 @@ def verify_record(folder: Path) -> None:
             raise IntegrityError("a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}...")
 
 
+def require(path: Path) -> None:
+    """InputError where nothing is at a path that is to be read."""
+    if not path.exists():
+        stopped = "repeat the command that wrote it: it was stopped while it replaced it"
+        remedy = stopped if retired_path(path).exists() else similar_path(path)
+        raise InputError("no such file or folder", where=str(path), remedy=remedy)
+
+
 def digest(path: Path) -> str:
     """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest.
 
@@ -594,10 +602,7 @@ def digest(path: Path) -> str:
         InputError: nothing is there, or an unfinished result. IntegrityError: a finished result or its bookkeeping was altered.
     """
     path = Path(path)
-    if not path.exists():
-        stopped = "repeat the command that wrote it: it was stopped while it replaced it"
-        remedy = stopped if retired_path(path).exists() else similar_path(path)
-        raise InputError("no such file or folder", where=str(path), remedy=remedy)
+    require(path)
     if path.is_file():
         return sha256_file(path)
     verify_record(path)

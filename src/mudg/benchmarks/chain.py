@@ -142,19 +142,16 @@ def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConf
 class FillViews(Output):
     """The scorer's baseline on some trajectories as folders of views, so that it is a method like the others."""
 
+    verb_name = FILL
     version, files = 1, below("*", OBSERVATION_FILES)
     scene: Path
     fused: Path
     paths: tuple[Trajectory, ...]
 
-    @classmethod
-    def verb(cls) -> str:
-        return FILL
-
     def key_settings(self) -> dict[str, Any]:
         return {"trajectories": [path.name for path in self.paths]}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         fill = score.baseline_of(read_scene(self.scene), read_fused(self.fused))
         with log.task(FILL, sum(map(len, self.paths))) as bar:
             for path in self.paths:
@@ -168,18 +165,15 @@ class FillViews(Output):
 class ExactViews(Output):
     """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
 
+    verb_name = EXACT
     version, files = 1, below("*", OBSERVATION_FILES)
     truth: Path
     paths: tuple[Trajectory, ...]
 
-    @classmethod
-    def verb(cls) -> str:
-        return EXACT
-
     def key_settings(self) -> dict[str, Any]:
         return {"trajectories": [path.name for path in self.paths if path.origin == "shifted"]}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         for name in self.key_settings()["trajectories"]:
             views = read_observations(self.truth / name)
             with ObservationWriter(work.path / name, name, EXACT) as writer:

@@ -259,6 +259,7 @@ def shipped_features(device: torch.device | None = None) -> CodecFeatures:
 class ScoreTargets(Output):
     """Score a method's views (folders of observations) of a log; writes its values and its pictures for the page."""
 
+    verb_name = "bench real score"
     version, files = 2, ("metrics.json", "pictures/*.jpg")
     log: Path
     truth: Path
@@ -267,14 +268,10 @@ class ScoreTargets(Output):
     device: str = "cpu"
     """Of the network behind the perceptual distance."""
 
-    @classmethod
-    def verb(cls) -> str:
-        return "bench real score"
-
     def key_settings(self) -> dict[str, Any]:
         return {"protocol": self.protocol.name, "columns": list(self.protocol.columns), "perceptual_views": PERCEPTUAL_VIEWS}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         scene, targets, finder, protocol = read_scene(self.log), read_targets(self.truth), ViewFinder(self.views), self.protocol
         sampled = _perceptual_views(targets) if any(name.startswith("perceptual") for name in protocol.columns) else set()
         features = None

@@ -52,7 +52,7 @@ class Film(Output):
         settings = {"columns": list(self.views), "trajectories": [path.name for path in self.paths], "panel_width_px": PANEL_WIDTH}
         return settings if self.videos else {**settings, "videos": False}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         listed = {name: {k: v for one in of for k, v in list_observation_sets(one).items()} for name, of in self.views.items()}
         playable = self.videos and bool(video_encoders())
         for path in self.paths:

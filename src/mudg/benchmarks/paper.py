@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
+from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
 from mudg.base.html import markdown as rendered
 from mudg.base.run_folder import refuse_overlap
 from mudg.benchmarks import page as pages
@@ -56,7 +56,6 @@ NOT_SCORED: Final = "no score of this version"
 OTHER_N: Final = "other n"
 POOLED: Final = ("distributions", "videos")
 """Entries of metrics.json whose sets of features, one per trajectory, are put together over all logs."""
-ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 NONE: Final = "-"
 """What stands in a column without any number; a note gives the reason once."""
 Files = dict[str, dict[str, list[str]]]

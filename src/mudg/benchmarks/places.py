@@ -212,19 +212,16 @@ def imported(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> P
 class ShownFrames(Output):
     """The table's frames of a scene, with its rule of what is held out."""
 
+    verb_name = "frames of a table"
     version, files = 1, SCENE_FILES
     scene: Path
     frames: tuple[int, int] | None
     table: PaperTable
 
-    @classmethod
-    def verb(cls) -> str:
-        return "frames of a table"
-
     def key_settings(self) -> dict[str, Any]:
         return {"frames": self.frames, "held_out_every": self.table.held_out_every, "front_only": self.table.front_only}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         scene = read_scene(self.scene)
         camera = first_camera(scene, ())
         times = np.array(sorted(frame.view.time_s for frame in scene.frames_of(camera)))

@@ -65,15 +65,12 @@ PAGES: Final = ("bench.json", "bench.md", "page.html")
 class PartOfScene(Output):
     """A part of a scene that a split shows."""
 
+    verb_name = "part of a scene"
     version, files = 1, SCENE_FILES
     split: str
     shown: tuple[str, ...]
     digests_read: Mapping[str, str]
     write: Callable[[Path], Scene]
-
-    @classmethod
-    def verb(cls) -> str:
-        return "part of a scene"
 
     def inputs(self) -> dict[str, str]:
         return dict(self.digests_read)
@@ -81,7 +78,7 @@ class PartOfScene(Output):
     def key_settings(self) -> dict[str, Any]:
         return {"split": self.split, "shown": list(self.shown)}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         scene = self.write(work.path)
         return {"frames": len(scene.frames), "sweeps": len(scene.sweeps)}
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import changed, setting, settings
 from mudg.base.devices import DeviceName
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing.view_settings import ScoreConfig
@@ -17,7 +13,7 @@ from mudg.scene.settings import FuseConfig
 from mudg.steps.settings.presets import PresetName, run_preset
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class BenchOwn:
     """The settings of ``mudg bench`` without those of the steps that it takes."""
 
@@ -26,7 +22,7 @@ class BenchOwn:
     convert."""
     cities: Literal["reported", "development"] = "reported"
     """mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen."""
-    count: int = Field(default=6, ge=1, le=6)
+    count: int = setting(default=6, ge=1, le=6)
     """mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the
     recorded path."""
     steps: tuple[int, ...] = (1, 2, 8)
@@ -35,7 +31,7 @@ class BenchOwn:
     """mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
     deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and
     likewise steps and eta."""
-    eta: float | None = Field(default=None, ge=0, le=1)
+    eta: float | None = setting(default=None, ge=0, le=1)
     """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
@@ -43,20 +39,20 @@ class BenchOwn:
     published-type models on CUDA devices (shift, real, paper)."""
     harmonize: bool = False
     """edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them."""
-    threads: int = Field(default=1, ge=1)
+    threads: int = setting(default=1, ge=1)
     """mdm, poses, edit: number of torch threads."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     list: Literal["development", "reported"] = "development"
     """shift: list of logs. Choose settings on development; report results on reported, on which nothing was chosen."""
-    logs: int = Field(default=8, ge=1, le=8)
+    logs: int = setting(default=8, ge=1, le=8)
     """shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
     """shift, real: methods to compare: those of the default; pvg, s3gaussian, bezier, omnire, emernerf and difix; and
     street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt,
     mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone
     in its input. paper: any of these of shift, and freevs; with the default, all of them."""
-    iterations: int = Field(default=1000, ge=1)
+    iterations: int = setting(default=1000, ge=1)
     """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
     continue_fit: bool = True
     """shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as
@@ -67,7 +63,7 @@ class BenchOwn:
     variant: tuple[str, ...] = ()
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such
     as virtual.color_weight. Both of its fits have them."""
-    processes: int = Field(default=0, ge=0)
+    processes: int = setting(default=0, ge=0)
     """shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
     core). Results do not depend on it."""
     videos: bool = True
@@ -89,25 +85,25 @@ class BenchOwn:
     frames: str = ""
     """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says).
     paper with a list of cities: 0:END (empty = 0:24)."""
-    pose_iterations: int = Field(default=300, ge=1)
+    pose_iterations: int = setting(default=300, ge=1)
     """poses, edit: optimisation steps of every fit."""
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class BenchConfig(BenchOwn):
     """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on generated cities
     against exact ground truth; complete methods on real logs; or fill a table of a paper."""
 
-    fuse: FuseConfig = Field(default_factory=FuseConfig)
+    fuse: FuseConfig = setting(default_factory=FuseConfig)
     """shift, real, paper: how the clouds of every log are made."""
-    synthesize: SynthesizeConfig = Field(default_factory=SynthesizeConfig)
+    synthesize: SynthesizeConfig = setting(default_factory=SynthesizeConfig)
     """shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are
     generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from)."""
-    fit: FitConfig = Field(default_factory=FitConfig)
+    fit: FitConfig = setting(default_factory=FitConfig)
     """shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
-    score: ScoreConfig = Field(default_factory=ScoreConfig)
+    score: ScoreConfig = setting(default_factory=ScoreConfig)
     """paper: how every row is scored; files of weights are given here."""
 
 
@@ -119,8 +115,9 @@ def bench_preset(name: PresetName = "default") -> BenchConfig:
         UsageError: no such preset.
     """
     run = run_preset(name)
-    return BenchConfig(
-        model=run.synthesize.model, iterations=run.fit.iterations, continue_fit=run.continue_fit, fuse=run.fuse,
-        synthesize=replace(run.synthesize, model=SynthesizeConfig().model, cameras=SynthesizeConfig().cameras),
-        fit=replace(run.fit, iterations=FitConfig().iterations),
-    )  # fmt: skip
+    usual = SynthesizeConfig()
+    return changed(BenchConfig(), {
+        "model": run.synthesize.model, "iterations": run.fit.iterations, "continue_fit": run.continue_fit, "fuse": run.fuse,
+        "synthesize": changed(run.synthesize, {"model": usual.model, "cameras": usual.cameras}),
+        "fit": changed(run.fit, {"iterations": FitConfig().iterations}),
+    })  # fmt: skip

@@ -85,6 +85,7 @@ class Targets:
 class MakeTargets(Output):
     """Write the truth of a log under a protocol."""
 
+    verb_name = "bench real truth"
     version, files = 2, ("targets.json", "maps/*.safetensors", "pictures/*.jpg")
     log: Path
     """The whole log."""
@@ -95,14 +96,10 @@ class MakeTargets(Output):
     """Held-out frames, which are scored; empty = every frame of `cameras`."""
     cameras: tuple[str, ...]
 
-    @classmethod
-    def verb(cls) -> str:
-        return "bench real truth"
-
     def key_settings(self) -> dict[str, Any]:
         return {"protocol": asdict(self.protocol), "held_out": list(self.held), "cameras": list(self.cameras)}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         scene, hidden = read_scene(self.log), set(self.held)
         maker = _Maker(self.protocol, scene, self.shown)
         frames = [f for f in scene.frames if (f.id in hidden if hidden else f.view.camera.name in self.cameras)]

@@ -537,12 +537,12 @@ def _psnr_of_dynamic(pair: Pair) -> float | None:
 
 @dataclass(frozen=True)
 class MetricRow:
-    """One row of the table: what it needs, which way is better, how to build it (None: weights not part of this build)."""
+    """One row of the table: what it needs, which way is better (one: nearest to 1), how to build it (None: its weights are not shipped)."""
 
     title: str
     unit: str
     needs: tuple[str, ...]
-    better: Literal["higher", "lower"]
+    better: Literal["higher", "lower", "one"]
     build: Callable[[], Metric] | None
 
 
@@ -553,7 +553,7 @@ METRICS: Final[dict[str, MetricRow]] = {
         "PSNR of dynamic objects", "dB", ("dynamic objects", "rgb"), "higher", lambda: FrameMean(_psnr_of_dynamic)
     ),
     "perceptual": MetricRow("perceptual", "", ("rgb", "features of the shipped codec"), "lower", None),
-    "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "lower", Flicker),
+    "flicker": MetricRow("flicker", "", ("every frame", "rgb"), "one", Flicker),
     "warp_error": MetricRow("warp error", "", ("every frame", "rgb"), "lower", None),
     "temporal_flickering": MetricRow("temporal flickering", "", ("views",), "higher", None),
     "lpips": MetricRow("LPIPS", "", ("rgb", "LPIPS weights"), "lower", None),

@@ -27,6 +27,7 @@ from mudg.base import log, memory, store
 from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.records import understood
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Condition, FusedCloud, Photo, Scene, Trajectory
 from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
@@ -100,7 +101,7 @@ def recorded_drive(config: SynthesizeConfig, given: JobInputs) -> Drive:
     return Drive(scene, read_fused(given.fused), recorded_images(scene, config), fit)
 
 
-def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: Path) -> dict[str, Any]:
+def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:
     """Generate all trajectories of the configuration, one folder of observations each; returns a summary.
 
     Raises:
@@ -121,7 +122,7 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, out: 
     processes = config.processes or usual_processes(config, paths)
     model = loading.load_any(config) if processes == 1 else None  # several processes load one each
     try:
-        frames = _run_jobs([(config, given, out, path, model) for path in paths], names, processes)
+        frames = _run_jobs([(config, given, work.path, path, model) for path in paths], names, processes)
     finally:
         _recorded_again.cache_clear()
     seconds = time.monotonic() - started

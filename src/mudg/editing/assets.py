@@ -20,6 +20,7 @@ from mudg.base.errors import InputError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.processes import one_torch_thread
 from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.run_folder import ResultFile
 from mudg.base.types import View
 from mudg.editing.apply import views_of
 from mudg.editing.light import surface_light
@@ -48,10 +49,10 @@ class AssetHeader(StrictRecord):
     origin: str
 
 
-def write_asset_from(parts: RunParts, name: str, out: Path) -> dict[str, Any]:
+def write_asset_from(parts: RunParts, name: str, file: ResultFile) -> dict[str, Any]:
     """Write one object of a fit, or of a run, to a file; returns what it is. UsageError where there is no such object."""
     asset = asset_from(parts, name)
-    write_asset(out, asset)
+    write_asset(file.path, asset)
     log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions)")
     return {"id": name}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from mudg.editing.light import surface_light, take_light
 from mudg.editing.model import GROUND_CLASSES, Asset, ground_points, lowest_points
 from mudg.editing.plan import Background, EditPlan, EditSources, EditWorld, check, plan_edits, shown_anew
 from mudg.editing.runs import RunParts, find_run
-from mudg.editing.script import AssetSource, EditScript, read_edits
+from mudg.editing.script import AssetSource, EditScript
 from mudg.editing.weathered import conditions_of
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model
@@ -140,9 +139,3 @@ def opener(script: EditScript) -> Callable[[AssetSource], Asset]:
         return asset_from(find_run(script.path_of(source.run or "")), source.id or "")
 
     return opened
-
-
-def read_and_digest(path: Path) -> tuple[EditScript, str]:
-    """A script and the digest of it and of what it reads."""
-    script = read_edits(path)
-    return script, script.digest()

@@ -21,6 +21,7 @@ from mudg.base.devices import choose_device, memory_of
 from mudg.base.errors import UsageError
 from mudg.base.palette import CLASSES
 from mudg.base.processes import computed_ahead
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Observation, Scene, Trajectory, View
 from mudg.baselines.emernerf.fit import load_field, observe
 from mudg.core import trajectory
@@ -80,14 +81,14 @@ def prepare(config: RenderConfig, scene: Path, model: Path, script: EditScript |
     return edited
 
 
-def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, out: Path) -> dict[str, Any]:
+def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir) -> dict[str, Any]:
     """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a summary. An
     interrupted run continues with the next missing view.
 
     Args:
         scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare`` made of them.
     """
-    followers = list[RepairedViews]()
+    followers, out = list[RepairedViews](), work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
         loaded, (draw, source) = read_scene(scene), _field_drawer(config, model, device)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 from mudg.diffusion.settings.harmonize import HarmonizeConfig
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
 
@@ -28,13 +25,13 @@ class RenderConfig:
     paths: tuple[str, ...] = ()
     """Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m
     further ahead with every frame. A minus means down, right, slower."""
-    width_px: int = Field(default=0, ge=0)
+    width_px: int = setting(default=0, ge=0)
     """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
     """Ids of tracked objects to leave out, as listed in the scene."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
-    harmonize: HarmonizeConfig = Field(default_factory=HarmonizeConfig)
+    harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
     """With an edit script: let the diffusion model repair what the edits touch."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
@@ -42,15 +39,15 @@ class RenderConfig:
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class ScoreConfig:
     """Score rendered and generated views against ground truth where it exists."""
 
-    width_px: int = Field(default=0, ge=0)
+    width_px: int = setting(default=0, ge=0)
     """Image width in pixels at which everything is compared; the height follows (0 = the size of the scene's camera)."""
     baseline: bool = True
     """Also score a baseline without learning: the fused points, with every hole filled by the nearest point."""
-    perceptual_views: int = Field(default=8, ge=0)
+    perceptual_views: int = setting(default=8, ge=0)
     """Number of views per trajectory, evenly spread, at which the perceptual distance is computed (0 = none). It costs more than
     all other metrics together."""
     lpips_weights: str = ""

@@ -22,6 +22,8 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.layout import below
 from mudg.base.palette import UNLABELLED
+from mudg.base.processes import one_torch_thread
+from mudg.base.run_folder import ResultFile, RunDir
 from mudg.base.types import PointCloud, Scene
 from mudg.base.versions import version
 from mudg.core import harmonics
@@ -311,6 +313,7 @@ class Exported:
     edited: bool = False
 
     @classmethod
+    @one_torch_thread()
     def of(cls, parts: RunParts, script: EditScript | None) -> Exported:
         """The parts of a source, with an edit script carried out."""
         recorded = None if parts.scene is None else read_scene(parts.scene)
@@ -345,9 +348,10 @@ def check(config: ExportConfig, name: str, out: Path) -> None:
         _refuse_name(out, name)
 
 
-def write_folder(name: str, given: Exported, out: Path) -> dict[str, Any]:
+@one_torch_thread()
+def write_folder(name: str, given: Exported, recorded: Scene, work: RunDir) -> dict[str, Any]:
     """Write cameras, or a log over time, to the work folder; returns a summary."""
-    recorded = _known(given)
+    out = work.path
     if name not in CAMERAS:
         return write_messages(name, records_of(recorded, _points(given)), out)
     names = picture_names(recorded)
@@ -361,9 +365,10 @@ def write_folder(name: str, given: Exported, out: Path) -> dict[str, Any]:
     return {"format": name, "images": len(names)}
 
 
-def write_file(config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+@one_torch_thread()
+def write_file(config: ExportConfig, name: str, given: Exported, file: ResultFile) -> dict[str, Any]:
     """Write Gaussians, or a log over time, as one file; returns what the file is."""
-    about = (_messages if name in SUFFIXES else _gaussians)(config, name, given, out)
+    about = (_messages if name in SUFFIXES else _gaussians)(config, name, given, file.path)
     return {"format": name, "mudg": version(), **about}
 
 
@@ -471,12 +476,12 @@ def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> d
     if name == "rerun" and given.model is not None:
         splats = splat_scene(given.model, middle_s(given.model, given.log))
     if name != "rerun" or given.log is not None:
-        records = records_of(_known(given), _points(given) if splats is None else None)
+        records = records_of(recorded_scene(given), _points(given) if splats is None else None)
     return write_log(name, Told(records, splats), out)
 
 
-def _known(given: Exported) -> Scene:
-    """The recorded scene; InputError if none is known."""
+def recorded_scene(given: Exported) -> Scene:
+    """The recorded scene of what is exported; InputError if none is known."""
     if given.log is None:
         raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
             remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip

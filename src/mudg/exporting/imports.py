@@ -12,6 +12,7 @@ import torch
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
+from mudg.base.run_folder import ResultFile, RunDir
 from mudg.editing.assets import write_asset
 from mudg.editing.model import Asset
 from mudg.exporting.export import model_of_cloud
@@ -33,11 +34,11 @@ OUTSIDE: Final = 0.5
 """Percent of the solid Gaussians at either end of an axis that may stand out of the box."""
 
 
-def write_object(config: ImportConfig, file: Path, out: Path) -> dict[str, Any]:
+def write_object(config: ImportConfig, file: Path, result: ResultFile) -> dict[str, Any]:
     """Write the asset of a file; returns what it is."""
     cloud, found = read_file(file, config)
     asset = asset_of_cloud(cloud, config, f"{file.name} ({found})")
-    write_asset(out, asset)
+    write_asset(result.path, asset)
     length, width, height = asset.size_m
     log.info(f"asset: {len(asset)} Gaussians of a {found} file, {length:.2f} x {width:.2f} x {height:.2f} m")
     if cloud.degree:
@@ -45,13 +46,12 @@ def write_object(config: ImportConfig, file: Path, out: Path) -> dict[str, Any]:
     return {"format": found}
 
 
-def write_scene(config: ImportConfig, read: tuple[SplatCloud, str], file: Path, out: Path) -> dict[str, Any]:
+def write_scene(config: ImportConfig, file: Path, cloud: SplatCloud, found: str, work: RunDir) -> dict[str, Any]:
     """The folder of a fit in which nothing moves, of Gaussians and their format; returns a summary."""
-    cloud, found = read
     origin = _origin(cloud, config, file)
     begin = geometry.yaw_matrix(np.radians(config.yaw_deg)) @ geometry.yaw_matrix(0.0, [-value for value in origin])
     model = model_of_cloud(cloud.moved(begin), file.name)
-    save_model(replace(model, facts={**model.facts, "format": found}), out)
+    save_model(replace(model, facts={**model.facts, "format": found}), work.path)
     log.info(f"asset: a scene of {len(cloud)} Gaussians of a {found} file")
     return {"gaussians": len(cloud), "format": found, "origin_m": origin}
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class ExportConfig:
     """Write a fitted scene, or the cameras of its log, for other programs."""
 
@@ -29,7 +26,7 @@ class ExportConfig:
     """Version of spz. 4 needs the package zstandard."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class ImportConfig:
     """Read a file of Gaussians as an object that edit scripts can insert, or as a scene."""
 
@@ -37,7 +34,7 @@ class ImportConfig:
     """object: an asset file. scene: the folder of a fit in which nothing moves."""
     label: str = "object"
     """Class of the object, e.g. car or pedestrian."""
-    length_m: float | None = Field(default=None, gt=0)
+    length_m: float | None = setting(default=None, gt=0)
     """Scale the object so that its box has this length (not given: the file is in metres)."""
     yaw_deg: float = 0.0
     """Turn what the file holds by this angle about the vertical, counter-clockwise from above, so that an object looks, or a street leads,
@@ -45,6 +42,6 @@ class ImportConfig:
     origin_m: tuple[float, float, float] | None = None
     """With --kind scene: the place in the file that becomes the origin, after --axes and before --yaw-deg (not given: the file's own
     origin, or the middle of Gaussians that lie more than 16 km away). As a background of an edit script, a street begins there."""
-    axes: str = Field(default="file", pattern="^(file|viewer|world|[LRUDFB]{3})$")
+    axes: str = setting(default="file", pattern="^(file|viewer|world|[LRUDFB]{3})$")
     """Where x, y and z of the file point. file: as the file says, else as viewer. viewer: as programs expect of its format. world: x
     forward, y left, z up, as of export --axes world. Or three letters of L, R, U, D, F, B: RDF is x right, y down, z forward."""

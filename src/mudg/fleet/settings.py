@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class BatchConfig:
     """What runs for every scene of a list, and where."""
 
@@ -21,17 +18,17 @@ class BatchConfig:
     other steps are replaced. With it, --stages may be left out."""
     engine: Literal["local", "ray", "slurm"] = "local"
     """Where scenes run. local: on this machine. ray: as tasks of a Ray cluster. slurm: as tasks of an array job."""
-    jobs: int = Field(default=0, ge=0)
+    jobs: int = setting(default=0, ge=0)
     """local: scenes at the same time (0 = one per processor). slurm: tasks of the array job (0 = one)."""
-    cpus: float = Field(default=1.0, gt=0)
+    cpus: float = setting(default=1.0, gt=0)
     """ray, slurm: processors, and threads, of a scene."""
-    gpus: float = Field(default=0.0, ge=0)
+    gpus: float = setting(default=0.0, ge=0)
     """ray, slurm: GPUs of a scene."""
-    memory_gb: float = Field(default=0.0, ge=0)
+    memory_gb: float = setting(default=0.0, ge=0)
     """ray, slurm: gigabytes of memory of a scene (0 = not requested)."""
     ray_address: str = ""
     """Address of the Ray cluster (empty = as Ray finds it, or one on this machine)."""
     slurm_options: tuple[str, ...] = ()
     """Further options of sbatch, without the dashes, as time=4:00:00 partition=gpu. Slurm needs the time."""
-    grace_s: float = Field(default=100.0, ge=0)
+    grace_s: float = setting(default=100.0, ge=0)
     """Seconds that a step has to write its checkpoint when it is asked to stop."""

@@ -27,6 +27,7 @@ OUT = Flag("OUT", "first")
 class BatchRun(Step):
     """Process a long list of logs, on this machine, Ray, Slurm or any scheduler, or go on with it."""
 
+    verb_name = "batch run"
     section = "many drives"
     examples = (
         "mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
@@ -57,10 +58,6 @@ class BatchRun(Step):
     take_over: bool = False
     """Go on although a driver on another machine may still work on the batch."""
     settings: BatchConfig
-
-    @classmethod
-    def verb(cls) -> str:
-        return "batch run"
 
     @classmethod
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> BatchConfig:
@@ -94,6 +91,7 @@ def stage_lines() -> dict[str, tuple[str, ...]]:
 class BatchProgress(Step):
     """Show how far a batch is, what failed and what it took."""
 
+    verb_name = "batch status"
     section = "many drives"
     examples = ("mudg batch status runs --html --price 0.04",)
     out: Annotated[str, OUT]
@@ -105,10 +103,6 @@ class BatchProgress(Step):
     price: float = 0.0
     """Price of one core-hour."""
 
-    @classmethod
-    def verb(cls) -> str:
-        return "batch status"
-
     def act(self) -> dict[str, Any]:
         from mudg.fleet import batch
 
@@ -118,16 +112,13 @@ class BatchProgress(Step):
 class BatchRetry(Step):
     """Forget failures of a batch, so that the next run tries them again."""
 
+    verb_name = "batch retry"
     section = "many drives"
     examples = ("mudg batch retry runs --reason 5,137",)
     out: Annotated[str, OUT]
     """Folder or address of a batch."""
     reason: str = ""
     """Only these exit codes or reasons, with commas, e.g. 5,137 (empty = all)."""
-
-    @classmethod
-    def verb(cls) -> str:
-        return "batch retry"
 
     def act(self) -> dict[str, Any]:
         from mudg.fleet import batch

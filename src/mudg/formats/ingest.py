@@ -44,6 +44,8 @@ def write_scene(config: IngestConfig, source: Path, kind: str, work: RunDir) -> 
     Raises:
         InputError: the log is malformed or contradictory.
     """
+    if kind not in (CITY, _SCENE, config.format):
+        log.info(f"ingest: {source} recognised as {kind}")
     try:
         return _fill(work, kind, config, source)
     except BaseException:
@@ -93,23 +95,19 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     """Which format ``source`` has: one of a log, ``city`` or ``scene``.
 
     Raises:
-        UsageError: there is no such format. InputError: there is no log, or of no format that is known.
+        UsageError: there is no such format. InputError: the log has none that is known.
     """
     if str(source) == CITY:
         return CITY
     if config.format not in ("auto", *IMPORTERS):
         raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
             got=config.format)  # fmt: skip
-    if not source.exists():
-        raise InputError("driving log does not exist", where=str(source),
-            expected=f"a folder, a scene zip, or the word {CITY}")  # fmt: skip
     if config.format != "auto":
         return config.format
     if is_scene(source):
         return _SCENE
     for name, looks_like in RECOGNISERS.items():
         if looks_like(source):
-            log.info(f"ingest: {source} recognised as {name}")
             return name
     inside = "a file"
     if source.is_dir():

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.city.config import CityConfig
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class IngestConfig:
     """Convert a dataset log, or the built-in procedural city, to a scene directory."""
 
@@ -26,11 +23,11 @@ class IngestConfig:
     resolution: str = ""
     """Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never
     enlarged."""
-    workers: int = Field(default=0, ge=0)
+    workers: int = setting(default=0, ge=0)
     """Threads that convert frames (0 = one per processor). The result does not depend on it."""
     contact_sheet: bool = True
     """Write contact_sheet.jpg: frames with LiDAR points and boxes, and the scene from above. Check it after every import."""
-    test_every: int = Field(default=4, ge=0)
+    test_every: int = setting(default=4, ge=0)
     """Hold out every n-th frame of all cameras for scoring (0 = none)."""
     format: str = "auto"
     """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto = recognise it)."""
@@ -51,4 +48,4 @@ class IngestConfig:
     """Bridge gaps between vehicle poses with curves instead of refusing the frames in them."""
     untwist: Literal["auto", "yes", "no"] = "auto"
     """Compensate LiDAR scans for the vehicle's motion during a sweep (auto = if the dataset's scans need it)."""
-    city: CityConfig = Field(default_factory=CityConfig)
+    city: CityConfig = setting(default_factory=CityConfig)

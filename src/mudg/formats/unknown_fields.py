@@ -55,7 +55,9 @@ def note_unknown_within(kind: str, value: Any, known: Known, within: str = "") -
 
 
 def _collect(kind: str, names: Iterable[str]) -> None:
-    for name in names if _unknown is not None else ():
+    if _unknown is None:
+        return
+    for name in names:
         collected = _unknown.setdefault(kind, {})
         if len(collected) < _MOST_COLLECTED:
             collected[short(name, _MOST_LETTERS)] = None

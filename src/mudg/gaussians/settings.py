@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
 # settings of ``mudg fit --method emernerf`` ---------------------------------------------------------------------------
@@ -17,7 +14,7 @@ from mudg.base.devices import DeviceName
 GridSizes = tuple[int, int, int, int, int]
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class RadianceConfig:
     """Method emernerf: sizes and samples. A grid is five numbers: levels, features per level, cells along an axis of the coarsest
     and of the finest level, and log2 of the largest number of entries per level."""
@@ -29,13 +26,13 @@ class RadianceConfig:
         "shadow_weight": ("", 0.01), "cycle_weight": ("", 0.01),
     }  # fmt: skip
 
-    rays: int = Field(default=512, ge=1)
+    rays: int = setting(default=512, ge=1)
     """Pixels per step."""
-    lidar_rays: int = Field(default=256, ge=1)
+    lidar_rays: int = setting(default=256, ge=1)
     """LiDAR rays per step."""
     proposal_samples: tuple[int, int] = (64, 32)
     """Samples per ray of the two proposal rounds."""
-    samples: int = Field(default=32, ge=2)
+    samples: int = setting(default=32, ge=2)
     """Samples per ray of the fields."""
     static_grid: GridSizes = (8, 2, 16, 1024, 17)
     """Grid of the static field, in space."""
@@ -48,43 +45,43 @@ class RadianceConfig:
     """Grid of the first proposal network, in space."""
     second_proposal_grid: GridSizes = (5, 1, 16, 512, 16)
     """Grid of the second proposal network, in space."""
-    width: int = Field(default=32, ge=1)
+    width: int = setting(default=32, ge=1)
     """Width of the networks and of their features."""
-    proposal_width: int = Field(default=16, ge=1)
+    proposal_width: int = setting(default=16, ge=1)
     """Width of the proposal networks."""
 
 
 # fit ------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class StartConfig:
     """Initial Gaussians."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"far_m": ("", 150.0)}
 
-    gaussians: int = Field(default=70_000, ge=50)
+    gaussians: int = setting(default=70_000, ge=50)
     """Largest number of static Gaussians taken from the fused cloud; the same limit holds for all objects together."""
-    voxel_m: float = Field(default=0.15, gt=0)
+    voxel_m: float = setting(default=0.15, gt=0)
     """Static points are thinned to one per cube of this size, in metres (finer close to the recorded path). Smaller gives more
     detail and takes longer."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class DensifyConfig:
     """Adding, removing and shaping Gaussians during the fit."""
 
     kind: Literal["gradient", "mcmc", "none"] = "gradient"
     """gradient: clone, split and prune by image gradients. mcmc: move unused Gaussians and grow to max_gaussians. none: keep the
     initial number."""
-    max_gaussians: int = Field(default=120_000, ge=100)
+    max_gaussians: int = setting(default=120_000, ge=100)
     """Largest number of Gaussians. More give finer detail and take more time and memory."""
-    longest_to_middle: float = Field(default=10.0, ge=1)
+    longest_to_middle: float = setting(default=10.0, ge=1)
     """Largest ratio of a Gaussian's longest axis to its middle axis. Long needles look right on the recorded path only, so lower
     it if shifted views show them."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class ObjectConfig:
     """Dynamic objects."""
 
@@ -96,19 +93,19 @@ class ObjectConfig:
     """Initialise vehicles with their points mirrored to the side that LiDAR did not measure."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class PoseConfig:
     """Correction of the box poses of dynamic objects."""
 
     learn: bool = False
     """Correct the boxes while fitting (position and yaw at every key of a track). Use it if the boxes are noisy."""
-    start: float = Field(default=0.25, ge=0, le=1)
+    start: float = setting(default=0.25, ge=0, le=1)
     """Share of the iterations before the first round of corrections, 0 to 1."""
-    rounds: int = Field(default=4, ge=0)
+    rounds: int = setting(default=4, ge=0)
     """Number of correction rounds, spread evenly up to 85 % of the iterations (0 = only smooth the tracks)."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class AppearanceConfig:
     """Correction of camera poses and exposure while fitting; renders do not use it."""
 
@@ -123,7 +120,7 @@ class AppearanceConfig:
     recorded path."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class DrawingConfig:
     """How Gaussians are drawn while fitting; renders of the fitted scene draw them in the same way."""
 
@@ -139,78 +136,78 @@ class DrawingConfig:
     """ellipsoid, or disc: flat Gaussians (2DGS). Needs gsplat and densify.kind mcmc or none."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class RecordedLossConfig:
     """Loss weights of recorded views, and of the terms that every view has. 0 turns a term off."""
 
-    ssim_weight: float = Field(default=0.2, ge=0, le=1)
+    ssim_weight: float = setting(default=0.2, ge=0, le=1)
     """Share of structural similarity (SSIM) in the colour term, 0 to 1; the rest is absolute difference."""
-    lidar_weight: float = Field(default=0.1, ge=0)
+    lidar_weight: float = setting(default=0.1, ge=0)
     """Weight of LiDAR depth (relative error; the worst 5 % of the points are ignored)."""
-    sky_weight: float = Field(default=0.05, ge=0)
+    sky_weight: float = setting(default=0.05, ge=0)
     """Weight of the term that keeps the sky free of Gaussians, on recorded views."""
-    semantic_weight: float = Field(default=0.1, ge=0)
+    semantic_weight: float = setting(default=0.1, ge=0)
     """Weight of semantic classes (cross-entropy)."""
-    semantic_every: int = Field(default=3, ge=1)
+    semantic_every: int = setting(default=3, ge=1)
     """Learn classes from recorded views at every n-th step only. Classes converge early and cost a third of a step."""
-    object_weight: float = Field(default=0.0, ge=0)
+    object_weight: float = setting(default=0.0, ge=0)
     """Weight of the term that makes dynamic objects opaque or empty inside their boxes and removes haze outside (published:
     0.1)."""
-    opacity_weight: float | None = Field(default=None, ge=0)
+    opacity_weight: float | None = setting(default=None, ge=0)
     """Weight that lowers all opacities, so that Gaussians that no view needs fade (not given: 0.01 with mcmc, else 0)."""
-    scale_weight: float | None = Field(default=None, ge=0)
+    scale_weight: float | None = setting(default=None, ge=0)
     """Weight per metre that shrinks all Gaussians (not given: 0.001 with mcmc, else 0)."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class VirtualConfig:
     """mudg_s: learning from virtual views. Loss weights of 0 turn a term off."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"densify": ("confidence_power", False)}
 
-    probability: float = Field(default=0.4, ge=0, le=1)
+    probability: float = setting(default=0.4, ge=0, le=1)
     """Probability that a step uses a virtual view, 0 to 1 (published: 0.2)."""
-    continued_probability: float = Field(default=1.0, ge=0, le=1)
+    continued_probability: float = setting(default=1.0, ge=0, le=1)
     """The same for a fit that continues a finished one (`--start-from`), which has few steps to learn from them."""
     beside: bool = True
     """A step with a virtual view also learns from its recorded view. Off: from the virtual view alone, as published."""
-    start: float = Field(default=0.15, ge=0, le=1)
+    start: float = setting(default=0.15, ge=0, le=1)
     """Share of the iterations before virtual views are used, 0 to 1. A fit that continues a finished one uses them at once."""
-    stop: float = Field(default=0.9, ge=0, le=1)
+    stop: float = setting(default=0.9, ge=0, le=1)
     """Share of the iterations after which virtual views are no longer used, 0 to 1. Ending on recorded views restores quality on
     the recorded path."""
-    half_size: float = Field(default=0.8, ge=0, le=1)
+    half_size: float = setting(default=0.8, ge=0, le=1)
     """Share of the iterations up to which virtual views are used at half their size, 0 to 1: faster, with little loss. 0: always at
     full size. A fit that continues a finished one begins at 0.5. Views above 2.5 million pixels are never used at full size,
     except with 0."""
-    gaussians: int = Field(default=8000, ge=0)
+    gaussians: int = setting(default=8000, ge=0)
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
-    confidence_power: float = Field(default=0.5, ge=0)
+    confidence_power: float = setting(default=0.5, ge=0)
     """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all pixels count
     the same)."""
-    color_weight: float = Field(default=1.0, ge=0)
+    color_weight: float = setting(default=1.0, ge=0)
     """Weight of colour."""
-    ssim_weight: float = Field(default=0.3, ge=0, le=1)
+    ssim_weight: float = setting(default=0.3, ge=0, le=1)
     """Share of structural similarity (SSIM) in the colour term, 0 to 1."""
-    perceptual_weight: float = Field(default=0.3, ge=0)
+    perceptual_weight: float = setting(default=0.3, ge=0)
     """Weight of the perceptual distance, measured by `perception`."""
     perception: Literal["filters", "codec", "lpips"] = "filters"
     """Features of the perceptual distance. filters: a fixed filter bank. codec: the shipped diffusion model's codec, slower.
     lpips: the LPIPS network, which needs `lpips_weights`."""
     lpips_weights: str = ""
     """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package)."""
-    depth_weight: float = Field(default=0.3, ge=0)
+    depth_weight: float = setting(default=0.3, ge=0)
     """Weight of the generated dense depth (robust relative error)."""
-    lidar_weight: float = Field(default=0.2, ge=0)
+    lidar_weight: float = setting(default=0.2, ge=0)
     """Weight of the fused LiDAR points' depth in virtual views (relative error; the worst 5 % of the points are ignored)."""
-    sky_weight: float = Field(default=0.05, ge=0)
+    sky_weight: float = setting(default=0.05, ge=0)
     """Weight of the term that keeps the generated sky free of Gaussians (published: none)."""
-    semantic_weight: float = Field(default=0.02, ge=0)
+    semantic_weight: float = setting(default=0.02, ge=0)
     """Weight of generated classes (cross-entropy). It is small because Gaussians that learned from recorded frames know classes
     better than the shipped diffusion model."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class FitConfig:
     """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
 
@@ -222,16 +219,16 @@ class FitConfig:
     """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, supervised by
     virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier, difix (which learns from repaired renders): published
     methods for comparison (docs/baselines.md)."""
-    iterations: int = Field(default=2000, ge=1, le=1_000_000)
+    iterations: int = setting(default=2000, ge=1, le=1_000_000)
     """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
     to this number. With `--start-from`: further steps, the second half of a schedule of twice as many."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     cameras: tuple[str, ...] = ()
     """Cameras whose recorded images are fitted (empty = all)."""
-    width_px: int = Field(default=0, ge=0)
+    width_px: int = setting(default=0, ge=0)
     """Image width in pixels while fitting; the height follows (0 = as recorded). Lower it to save time and memory."""
-    sh_degree: int = Field(default=0, ge=0, le=3)
+    sh_degree: int = setting(default=0, ge=0, le=3)
     """Degree of the spherical harmonics for view-dependent colour. On short drives every degree above 0 overfits to the recorded
     path."""
     semantics: bool = True
@@ -240,17 +237,17 @@ class FitConfig:
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
-    checkpoint_every: int = Field(default=500, ge=1)
+    checkpoint_every: int = setting(default=500, ge=1)
     """Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a twentieth of
     the time."""
-    preview_every: int = Field(default=500, ge=1)
+    preview_every: int = setting(default=500, ge=1)
     """Steps between preview images."""
-    start: StartConfig = Field(default_factory=StartConfig)
-    densify: DensifyConfig = Field(default_factory=DensifyConfig)
-    objects: ObjectConfig = Field(default_factory=ObjectConfig)
-    poses: PoseConfig = Field(default_factory=PoseConfig)
-    appearance: AppearanceConfig = Field(default_factory=AppearanceConfig)
-    drawing: DrawingConfig = Field(default_factory=DrawingConfig)
-    loss: RecordedLossConfig = Field(default_factory=RecordedLossConfig)
-    virtual: VirtualConfig = Field(default_factory=VirtualConfig)
-    radiance: RadianceConfig = Field(default_factory=RadianceConfig)
+    start: StartConfig = setting(default_factory=StartConfig)
+    densify: DensifyConfig = setting(default_factory=DensifyConfig)
+    objects: ObjectConfig = setting(default_factory=ObjectConfig)
+    poses: PoseConfig = setting(default_factory=PoseConfig)
+    appearance: AppearanceConfig = setting(default_factory=AppearanceConfig)
+    drawing: DrawingConfig = setting(default_factory=DrawingConfig)
+    loss: RecordedLossConfig = setting(default_factory=RecordedLossConfig)
+    virtual: VirtualConfig = setting(default_factory=VirtualConfig)
+    radiance: RadianceConfig = setting(default_factory=RadianceConfig)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class AnnotateConfig:
     """Add the labels that a scene lacks: dense depth, semantic classes, sky and masks of dynamic objects, each with a
     confidence."""
@@ -30,18 +27,18 @@ class AnnotateConfig:
     Depth Anything (transformers) or Marigold (diffusers) model; or folder of a DepthLab written by mudg convert."""
     depth_guided: bool = True
     """Marigold: use LiDAR in every denoising step (slower). Off: only align the result to LiDAR."""
-    depth_steps: int = Field(default=0, ge=0)
+    depth_steps: int = setting(default=0, ge=0)
     """Marigold and DepthLab: denoising steps (0 = as in the model folder, or 50 for Marigold guided by LiDAR)."""
     device: DeviceName = "auto"
     """Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4 percent."""
-    sweeps: int = Field(default=6, ge=1, le=100)
+    sweeps: int = setting(default=6, ge=1, le=100)
     """Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth."""
     dynamic: bool = True
     """Write masks of dynamic objects, from the tracked boxes."""
     ego: bool = False
     """Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet
     is visible."""
-    processes: int = Field(default=0, ge=0)
+    processes: int = setting(default=0, ge=0)
     """Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device)."""

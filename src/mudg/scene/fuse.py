@@ -18,6 +18,7 @@ from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
+from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
 from mudg.core.calibration import match_cameras
 from mudg.core.fusion import (
@@ -46,8 +47,8 @@ MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
 """To match the cameras' colours: sweeps, images of each camera per sweep, and how far in time they may be."""
 
 
-def write_fusion(scene: Scene, config: FuseConfig, out: Path) -> dict[str, Any]:
-    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png`` to ``out``. Returns counts."""
+def write_fusion(config: FuseConfig, scene: Scene, work: RunDir) -> dict[str, Any]:
+    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png``. Returns counts."""
     for finding in check_distance(scene):
         log.warn(f"fuse: {finding.message}")
     cloud, report = fuse_scene(scene, config)
@@ -57,8 +58,8 @@ def write_fusion(scene: Scene, config: FuseConfig, out: Path) -> dict[str, Any]:
         )
     for words in (*describe(report), *describe_colors(cloud.colors)):
         log.info(f"fuse: {words}")
-    write_fused(out, cloud, report_record(report, rules_of(config)))
-    store.write_image(out / "top.png", top_view(scene, cloud, report))
+    write_fused(work.path, cloud, report_record(report, rules_of(config)))
+    store.write_image(work.path / "top.png", top_view(scene, cloud, report))
     return {"points_static": report.points_static, "objects": len(cloud.objects), "points_in": report.points_in}
 
 

@@ -25,6 +25,7 @@ from mudg.base import log, palette, store
 from mudg.base.devices import choose_device
 from mudg.base.processes import computed_ahead, one_torch_thread
 from mudg.base.records import understood
+from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Observation, Scene, View
 from mudg.core import metrics, project, view_metrics
 from mudg.core.losses import LPIPS_EPSILON
@@ -64,7 +65,7 @@ DEPTH_LIMIT_M: Final = 80.0
 
 
 def write_scores(
-    config: ScoreConfig, scene: Path, methods: Mapping[str, Path], out: Path, *, fused: Path | None = None, truth: Path | None = None
+    config: ScoreConfig, scene: Path, methods: Mapping[str, Path], work: RunDir, *, fused: Path | None = None, truth: Path | None = None
 ) -> dict[str, Any]:  # fmt: skip
     """Score every trajectory of every method; returns a summary.
 
@@ -76,7 +77,7 @@ def write_scores(
     Raises:
         InputError: nothing to score, or methods disagree about a trajectory's views.
     """
-    recorded = read_scene(scene)
+    recorded, out = read_scene(scene), work.path
     trajectories = trajectories_of(config, recorded, methods)
     reference = Reference(
         truth=truth_of(recorded) if truth is None else stored_truth(truth),

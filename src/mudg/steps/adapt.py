@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from mudg.diffusion.adapt import PlannedAdaptation
     from mudg.diffusion.settings.adapt import AdaptConfig
     from mudg.gaussians.settings import FitConfig
+    from mudg.steps.engine import Make
 
 
 class Adapt(Output):
@@ -30,7 +32,9 @@ class Adapt(Output):
     )
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "model"
+    from_run = ("fused", "fitted")
     version, files = 2, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/")
+    idle = ("processes",)
     short = ("model", "cameras", "shifts_m", "steps", "lr", "fit_iterations", "precision", "device", "processes", "seed")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
@@ -39,9 +43,6 @@ class Adapt(Output):
     fitted: Annotated[Path | None, Flag("FOLDER", "", "fitted")] = None
     """Gaussian scene written by fit, without virtual views (not given: that of the run at SCENE)."""
     settings: AdaptConfig
-
-    def required(self) -> tuple[str, ...]:
-        return ("fused", "fitted")
 
     def checked(self) -> Self:
         from mudg.base.devices import NETWORK_KINDS, choose_device
@@ -59,24 +60,23 @@ class Adapt(Output):
 
         return super().inputs() | {"model": digest(self.settings.model)}
 
-    def key_settings(self) -> dict[str, Any]:
-        return {name: value for name, value in super().key_settings().items() if name != "processes"}
-
-    def prepare(self, inputs: dict[str, str]) -> PlannedAdaptation:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.diffusion.adapt import PlannedAdaptation
 
-        return PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted))
-
-    def make(self, work: RunDir, prepared: PlannedAdaptation) -> dict[str, Any]:
-        folder = work.path / "work"
-        prepared.make_clips(fit_scene, folder)
-        adapted = Learn(out=folder / "learn", settings=prepared.training(folder)).run()
-        summary = prepared.write_model(adapted, folder, work.path)
-        shutil.rmtree(folder, ignore_errors=True)
-        return summary
+        return partial(adapted, PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted)))
 
     def resulting(self, folder: Path) -> Path:
         return folder / "model"
+
+
+def adapted(plan: PlannedAdaptation, work: RunDir) -> dict[str, Any]:
+    """Fits and clips of all lessons, some steps of training, and the better of both models."""
+    folder = work.path / "work"
+    plan.make_clips(fit_scene, folder)
+    model = Learn(out=folder / "learn", settings=plan.training(folder)).run()
+    summary = plan.write_model(model, folder, work.path)
+    shutil.rmtree(folder, ignore_errors=True)
+    return summary
 
 
 def fit_scene(settings: FitConfig, scene: Path, fused: Path | None, out: Path) -> None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.layout import SCENE_FILES
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
     from mudg.labels.settings import AnnotateConfig
+    from mudg.steps.engine import Make
 
 
 class Annotate(Listed):
@@ -23,6 +24,7 @@ class Annotate(Listed):
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "scene"
     version, files = 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", "labelled/")
+    idle = ("processes",)
     short = ("labeller", "weights", "depth_network", "device", "sweeps", "ego", "processes")
     scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
     """Scene directory written by ingest, or folder of mudg run."""
@@ -46,10 +48,7 @@ class Annotate(Listed):
 
         return super().inputs() | depth.digests(self.settings)
 
-    def key_settings(self) -> dict[str, Any]:
-        return {name: value for name, value in super().key_settings().items() if name != "processes"}  # it changes no result
-
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.labels import annotate
 
-        return annotate.write_labelled(self.settings, cast("Path", self.scene), work)
+        return partial(annotate.write_labelled, self.settings, cast("Path", self.scene))

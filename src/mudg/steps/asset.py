@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -12,14 +13,16 @@ from mudg.steps.engine import Result
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import ResultFile, RunDir, VerbOutput
+    from mudg.base.run_folder import VerbOutput
     from mudg.editing.runs import RunParts
     from mudg.exporting.settings import ImportConfig
+    from mudg.steps.engine import Make
 
 
 class AssetExport(Result):
     """Write one object of a fitted scene to a file that edit scripts can insert."""
 
+    verb_name = "asset export"
     section = "change a drive"
     examples = ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",)
     result = "asset"
@@ -33,10 +36,6 @@ class AssetExport(Result):
     """Scene directory that a Gaussian scene was fitted to; it tells from which sides the object was seen. A run has its own."""
     overwrite: bool = False
     """Replace the output if it exists."""
-
-    @classmethod
-    def verb(cls) -> str:
-        return "asset export"
 
     @property
     def is_file(self) -> bool:
@@ -60,10 +59,10 @@ class AssetExport(Result):
     def key_settings(self) -> dict[str, Any]:
         return {"id": self.track_id}
 
-    def make(self, work: ResultFile, prepared: Any) -> dict[str, Any]:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.editing import assets
 
-        return assets.write_asset_from(self.run_parts(), self.track_id, work.path)
+        return partial(assets.write_asset_from, self.run_parts(), self.track_id)
 
 
 def refuse_other_name(out: Path) -> None:
@@ -75,6 +74,7 @@ def refuse_other_name(out: Path) -> None:
 class AssetImport(Result):
     """Make an object, or a scene, of a file of Gaussians from another program."""
 
+    verb_name = "asset import"
     section = "change a drive"
     examples = ("mudg asset import van.ply --label van --length-m 5.2 --out assets/van.safetensors",)
     result = "asset"
@@ -85,10 +85,6 @@ class AssetImport(Result):
     overwrite: bool = False
     """Replace the output if it exists."""
     settings: ImportConfig
-
-    @classmethod
-    def verb(cls) -> str:
-        return "asset import"
 
     @property
     def is_file(self) -> bool:
@@ -111,14 +107,9 @@ class AssetImport(Result):
     def key_settings(self) -> dict[str, Any]:
         return super().key_settings() | ({"name": self.file.name} if self.is_file else {})
 
-    def prepare(self, inputs: dict[str, str]) -> Any:
-        from mudg.exporting import imports
-
-        return None if self.is_file else imports.read_file(self.file, self.settings)
-
-    def make(self, work: ResultFile | RunDir, prepared: Any) -> dict[str, Any]:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.exporting import imports
 
         if self.is_file:
-            return imports.write_object(self.settings, self.file, work.path)
-        return imports.write_scene(self.settings, prepared, self.file, work.path)
+            return partial(imports.write_object, self.settings, self.file)
+        return partial(imports.write_scene, self.settings, self.file, *imports.read_file(self.file, self.settings))

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from mudg.base.layout import MODEL_FILES, SCENE_FILES, below
-from mudg.steps.engine import script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
-    from mudg.editing.edit import PlannedEdit
     from mudg.editing.runs import RunParts
     from mudg.editing.settings import EditConfig
+    from mudg.steps.engine import Make
 
 _MODELS = (*MODEL_FILES, *below("fit/*", MODEL_FILES))
 _CLOUDS = ("static.safetensors", "objects/*.safetensors", "fuse.json")
@@ -56,23 +55,23 @@ class Edit(Output):
         return super().reads() | {"scene": parts.scene, "fused": parts.fused}
 
     def inputs(self) -> dict[str, str]:
+        from mudg.editing.script import read_edits
+
         parts = self.run_parts()
         fits = {f"fit {name}".strip(): path for name, path in parts.fits.items()}
-        return {"edits": script_of(self.script)[1]} | self.digests({**fits, "scene": parts.scene, "fused": parts.fused})
+        return {"edits": read_edits(self.script).digest()} | self.digests({**fits, "scene": parts.scene, "fused": parts.fused})
 
     def places(self) -> dict[str, Path | None]:
         parts = self.run_parts()
         return {} if parts.whole else {"scene": parts.scene, "fused": parts.fused}
 
-    def prepare(self, inputs: dict[str, str]) -> PlannedEdit:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.core.raster.place import drawing_device
         from mudg.editing.edit import PlannedEdit
+        from mudg.editing.script import read_edits
 
         drawing_device(self.settings.device, "render", self.settings.raster)
-        planned = PlannedEdit.of(self.settings, script_of(self.script)[0], self.run_parts())
+        planned = PlannedEdit.of(self.settings, read_edits(self.script), self.run_parts())
         if planned.parts.whole and planned.drive.plan.weather_of_beams is not None:
             inputs["weather of beams"] = "fog, rain"  # another result than before sweeps showed them
-        return planned
-
-    def make(self, work: RunDir, prepared: PlannedEdit) -> dict[str, Any]:
-        return prepared.write(self.settings, work)
+        return partial(planned.write, self.settings)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -15,21 +15,25 @@ if typing.TYPE_CHECKING:
     from mudg.editing.script import EditScript
 
 
+Make = Callable[[Any], dict[str, Any]]
+
+
 class Result(Step):
     """A step that makes a folder of its own, which is verified and reused, resumed, or replaced when the new one is finished.
 
-    A subclass says what it writes (`version`, `files`), and how (`make`). What it reads follows from its fields; the methods below are
-    overridden where it reads more, or less.
+    A subclass says what it writes (`version`, `files`), and how (`prepare`, or `make`). What it reads follows from its fields; the methods
+    below are overridden where it reads more, or less.
     """
 
     version: ClassVar[int]
     """Counts up when the rules of the verb change; older results are then made again."""
     files: ClassVar[tuple[str, ...]]
     """Patterns of what it writes (see `VerbOutput`)."""
+    idle: ClassVar[tuple[str, ...]] = ()
+    """Settings that no result depends on."""
     if typing.TYPE_CHECKING:
         out: Path
         overwrite: bool = False
-        settings: Any = None
 
     def act(self) -> Any:
         return fill(self)
@@ -52,8 +56,9 @@ class Result(Step):
     def reads(self) -> dict[str, Path | str | None]:
         """Files and folders that it reads, by their names in messages. The output must lie apart from all of them."""
         found = paths_of(self)
-        for name in [name for name in found if is_script(self, name) and found[name]]:
-            found |= {f"{found[name]}: {file}": path for file, path in script_of(Path(str(found[name])))[0].files().items()}
+        for path in [path for name, path in found.items() if is_script(self, name) and path]:
+            script = script_of(Path(path))
+            found |= {f"{path}: {file}": place for file, place in script.files().items()} if script is not None else {}
         return found
 
     def inputs(self) -> dict[str, str]:
@@ -63,34 +68,34 @@ class Result(Step):
     def digests(self, paths: Mapping[str, Path | str | None]) -> dict[str, str]:
         """Digests of files and folders by name, without those that are None or empty; of edit scripts by what they say."""
         from mudg.base import store
+        from mudg.editing.script import read_edits
 
         return {
-            name: script_of(Path(path))[1] if is_script(self, name) else store.digest(Path(path)) for name, path in paths.items() if path
-        }
+            name: read_edits(Path(path)).digest() if is_script(self, name) else store.digest(Path(path))
+            for name, path in paths.items() if path
+        }  # fmt: skip
 
     def key_settings(self) -> dict[str, Any]:
         """Settings that the result depends on, the other part of the key."""
         from mudg.base.config import result_settings
 
-        return result_settings(self.settings)
+        return {name: value for name, value in result_settings(vars(self)["settings"]).items() if name not in self.idle}
 
     def places(self) -> dict[str, Path | None]:
         """Inputs whose places the folder remembers for those who read it."""
         return {}
 
-    def prepare(self, inputs: dict[str, str]) -> Any:
-        """Read what is needed to refuse what cannot be done, before anything is written; `make` gets what it returns.
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        """What makes the result. All that can be refused is refused here, before anything is written.
 
         Args:
             inputs: digests; those that only reading tells are added.
         """
+        return self.make
 
-    def make(self, work: Any, prepared: Any) -> dict[str, Any]:
-        """Fill the folder, or go on with what an interrupted run left there. Returns the summary for its record.
-
-        Args:
-            work: the folder's `RunDir`; of a single file its `ResultFile`. prepared: what `prepare` returned.
-        """
+    def make(self, work: Any) -> dict[str, Any]:
+        """Fill the work folder (`RunDir`; of a single file its `ResultFile`), or go on with what an interrupted run left there. Returns the
+        summary for its record."""
         raise NotImplementedError
 
     def resulting(self, folder: Path) -> Path:
@@ -99,42 +104,46 @@ class Result(Step):
 
 
 def fill(step: Result) -> Path:
-    """Make the result of a step, or reuse it."""
+    """Make the result of a step, or reuse it. A path that leads nowhere is refused before anything heavy is loaded."""
+    from mudg.base import store
     from mudg.base.run_folder import ResultFile
 
-    step = step.checked()
+    for path in paths_of(step).values():
+        if path is not None:
+            store.require(Path(path))
     if step.is_file:
-        inputs, prepared = ready(step)
+        step, inputs, make = ready(step)
         with ResultFile.open(step.out, step.verb(), step.key_settings(), inputs, overwrite=step.overwrite) as file:
-            return file.reused() if file.complete else file.finish({**step.make(file, prepared), "inputs": inputs})
-    prepared, folder = opened(step)
+            return file.reused() if file.complete else file.finish({**make(file), "inputs": inputs})
+    step, folder, make = opened(step)
     if not folder.complete:
         try:
-            folder.finish(step.make(folder, prepared))
+            folder.finish(make(folder))
         except KeyboardInterrupt:
             folder.pause()
             raise
     return step.resulting(folder.path)
 
 
-def ready(step: Result) -> tuple[dict[str, str], Any]:
-    """Digests of what a step reads, and what it prepared: all that can be refused is, and nothing is written."""
+def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
+    """A step as it is carried out, digests of what it reads, and what makes it: all that can be refused is, and nothing is written."""
     from mudg.base.run_folder import refuse_overlap
 
     refuse_overlap(step.out, step.reads())
+    step = step.checked()
     inputs = step.inputs()
-    return inputs, step.prepare(inputs)
+    return step, inputs, step.prepare(inputs)
 
 
-def opened(step: Result) -> tuple[Any, RunDir]:
-    """What a step prepared, and its folder; that of a finished result is verified and said to be reused."""
+def opened(step: Result) -> tuple[Result, RunDir, Make]:
+    """A step as it is carried out, its folder, and what fills it; a finished result is verified and said to be reused."""
     from mudg.base.run_folder import RunDir
 
-    inputs, prepared = ready(step)
+    step, inputs, make = ready(step)
     folder = RunDir.open(step.out, step.output(), step.key_settings(), inputs, step.overwrite, step.places())
     if folder.complete:
         folder.reused()
-    return prepared, folder
+    return step, folder, make
 
 
 def paths_of(step: Step) -> dict[str, Path | str | None]:
@@ -164,8 +173,8 @@ def is_script(step: Step, name: str) -> bool:
     return name in {field.name for field in dataclasses.fields(step)} and flag_of(type(step), name).metavar.endswith(".yaml")
 
 
-def script_of(path: Path) -> tuple[EditScript, str]:
-    """An edit script, and the digest of what it says and of the files that it names."""
-    from mudg.editing.carried import read_and_digest
+def script_of(path: Path | None) -> EditScript | None:
+    """The edit script at a path, if there is one."""
+    from mudg.editing.script import read_edits
 
-    return read_and_digest(path)
+    return None if path is None else read_edits(path)

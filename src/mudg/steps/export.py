@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -9,10 +10,10 @@ from mudg.steps.engine import Result, script_of
 from mudg.steps.step import FILE_YAML, RUN, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import ResultFile, RunDir, VerbOutput
+    from mudg.base.run_folder import VerbOutput
     from mudg.editing.runs import RunParts
-    from mudg.exporting.export import Exported
     from mudg.exporting.settings import ExportConfig
+    from mudg.steps.engine import Make
 
 
 class Export(Result):
@@ -40,12 +41,6 @@ class Export(Result):
     overwrite: bool = False
     """Replace the output if it exists."""
     settings: ExportConfig
-
-    def act(self) -> Path:
-        from mudg.base.processes import one_torch_thread
-
-        with one_torch_thread():
-            return super().act()
 
     def output(self) -> VerbOutput:
         from mudg.base.run_folder import VerbOutput
@@ -82,14 +77,10 @@ class Export(Result):
     def key_settings(self) -> dict[str, Any]:
         return super().key_settings() | {"format": self.format}
 
-    def prepare(self, inputs: dict[str, str]) -> Exported:
-        from mudg.exporting.export import Exported
-
-        return Exported.of(self.run_parts(), None if self.edits is None else script_of(self.edits)[0])
-
-    def make(self, work: ResultFile | RunDir, prepared: Exported) -> dict[str, Any]:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.exporting import export
 
+        exported = export.Exported.of(self.run_parts(), script_of(self.edits))
         if self.is_file:
-            return export.write_file(self.settings, self.format, prepared, work.path)
-        return export.write_folder(self.format, prepared, work.path)
+            return partial(export.write_file, self.settings, self.format, exported)
+        return partial(export.write_folder, self.format, exported, export.recorded_scene(exported))

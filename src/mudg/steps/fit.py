@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
@@ -13,9 +14,9 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir, VerbOutput
-    from mudg.gaussians.fit import FitInputs
+    from mudg.base.run_folder import VerbOutput
     from mudg.gaussians.settings import FitConfig
+    from mudg.steps.engine import Make
 
 
 class Fit(Output):
@@ -82,12 +83,12 @@ class Fit(Output):
     def places(self) -> dict[str, Path | None]:
         return {"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused}
 
-    def prepare(self, inputs: dict[str, str]) -> FitInputs | None:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         if self.reads_scene_alone:
             from mudg.base.devices import choose_device
+            from mudg.baselines.emernerf.fit import fit_radiance
 
-            choose_device(self.settings.device, "fit")
-            return None
+            return partial(fit_radiance, self.settings, self.scene, choose_device(self.settings.device, "fit"))
         from mudg.gaussians import fit
         from mudg.gaussians.storage import StartFit
         from mudg.gaussians.views import virtual_sets
@@ -99,15 +100,4 @@ class Fit(Output):
             inputs |= self.digests({name: path for name, path in paths_of(self).items() if name.startswith("observations")})
         inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
         fit.check_device(self.settings)
-        return fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
-
-    def make(self, work: RunDir, prepared: FitInputs | None) -> dict[str, Any]:
-        if prepared is None:
-            from mudg.base.devices import choose_device
-            from mudg.baselines.emernerf.fit import fit_radiance
-            from mudg.scene.read import read_scene
-
-            return fit_radiance(self.settings, read_scene(self.scene), work, choose_device(self.settings.device, "fit"))
-        from mudg.gaussians import fit
-
-        return fit.write_fit(self.settings, prepared, work)
+        return partial(fit.write_fit, self.settings, fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun))

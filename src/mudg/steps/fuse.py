@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
-    from mudg.base.types import Scene
     from mudg.scene.settings import FuseConfig
+    from mudg.steps.engine import Make
 
 
 class Fuse(Listed):
@@ -26,15 +26,10 @@ class Fuse(Listed):
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     settings: FuseConfig
 
-    def prepare(self, inputs: dict[str, str]) -> Scene:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.scene import fuse
         from mudg.scene.read import read_scene
 
         scene = read_scene(cast("Path", self.scene))
         fuse.refuse_without_lidar(scene)
-        return scene
-
-    def make(self, work: RunDir, prepared: Scene) -> dict[str, Any]:
-        from mudg.scene import fuse
-
-        return fuse.write_fusion(prepared, self.settings, work.path)
+        return partial(fuse.write_fusion, self.settings, scene)

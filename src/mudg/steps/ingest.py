@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from mudg.base.errors import UsageError
+from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag, usage
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
     from mudg.formats.settings import IngestConfig
+    from mudg.steps.engine import Make
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
 OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
@@ -34,6 +34,7 @@ class Ingest(Listed):
     smaller = "smaller images (--resolution; of a city --city.width), fewer --frames, one image at a time (--workers 1)"
     result = "scene"
     version, files = 1, (*SCENE_FILES, "contact_sheet.jpg")
+    idle = ("workers",)
     short = ("resolution", "frames", "cameras", "sequence", "test_every", "city.seed", "city.n_frames", "city.width", "city.height")
     parts = {"city": "Generate a city: a scene with exact truth."} | {
         name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
@@ -79,10 +80,14 @@ class Ingest(Listed):
         return replace(self, overwrite=self.overwrite or ingest.is_abandoned(self.out))
 
     def reads(self) -> dict[str, Path | str | None]:
+        if self.log != "city" and not Path(self.log).exists():
+            raise InputError("driving log does not exist", where=str(self.log), expected="a folder, a scene zip, or the word city",
+                remedy=similar_path(self.log))  # fmt: skip
         from mudg.formats import ingest
 
-        named = {"log": "" if self.log == "city" else self.log, "poses": self.settings.poses, "boxes": self.settings.boxes}
-        return named | ingest.files_read(self.settings, Path(self.log), self.kind)
+        log = "" if self.log == "city" else self.log
+        read = ingest.files_read(self.settings, Path(self.log), self.kind)
+        return {"log": log, "poses": self.settings.poses, "boxes": self.settings.boxes, **read}
 
     def inputs(self) -> dict[str, str]:
         from mudg.formats import ingest
@@ -90,10 +95,9 @@ class Ingest(Listed):
         return {} if self.kind == "city" else {"source": ingest.source_digest(Path(self.log), self.kind, self.settings)}
 
     def key_settings(self) -> dict[str, Any]:
-        idle = ("workers",) if self.kind == "city" else ("workers", "city")  # what the result does not depend on
-        return {name: value for name, value in super().key_settings().items() if name not in idle}
+        return {name: value for name, value in super().key_settings().items() if name != "city" or self.kind == "city"}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.formats import ingest
 
-        return ingest.write_scene(self.settings, Path(self.log), self.kind, work)
+        return functools.partial(ingest.write_scene, self.settings, Path(self.log), self.kind)

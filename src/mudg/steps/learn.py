@@ -36,8 +36,7 @@ class Learn(Output):
     def act(self) -> Path:
         from mudg.diffusion import learn
 
-        step = self.checked()
-        learn.train(step.settings, step.out, step.output(), lambda: opened(step)[1])
+        learn.train(learn.check(self.settings), self.out, self.output(), lambda: opened(self)[1])
         return self.out / "model"
 
     def checked(self) -> Self:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
@@ -12,13 +13,14 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
     from mudg.editing.view_settings import RenderConfig
+    from mudg.steps.engine import Make
 
 
 class RenderViews(Output):
     """Render RGB, depth and semantics of a fitted scene on shifted trajectories."""
 
+    verb_name = "render"
     section = "single steps, in the order of use"
     examples = (
         "mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",
@@ -26,6 +28,7 @@ class RenderViews(Output):
     )
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
+    from_run = ("model",)
     version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES))
     short = ("cameras", "shifts_m", "paths", "width_px", "video", "remove_tracks", "device", "harmonize.on", "harmonize.model")
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
@@ -37,13 +40,6 @@ class RenderViews(Output):
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
     """Point clouds written by fuse; for --harmonize.on."""
     settings: RenderConfig
-
-    @classmethod
-    def verb(cls) -> str:
-        return "render"
-
-    def required(self) -> tuple[str, ...]:
-        return ("model",)
 
     def checked(self) -> Self:
         if self.settings.harmonize.on and (self.edits is None or self.fused is None):
@@ -59,13 +55,9 @@ class RenderViews(Output):
 
         return read | self.digests({"fused": self.fused}) | {"diffusion": digest(self.settings.harmonize.model)}
 
-    def prepare(self, inputs: dict[str, str]) -> Any:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.editing import render
 
-        script = None if self.edits is None else script_of(self.edits)[0]
-        return render.prepare(self.settings, self.scene, cast("Path", self.model), script, self.fused)
-
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.editing import render
-
-        return render.write_views(self.settings, self.scene, cast("Path", self.model), prepared, work.path)
+        model, script = cast("Path", self.model), script_of(self.edits)
+        edited = render.prepare(self.settings, self.scene, model, script, self.fused)
+        return partial(render.write_views, self.settings, self.scene, model, edited)

@@ -53,12 +53,12 @@ class Run(Output):
         return pipeline.run_chain(self.settings, self.source, self.out, overwrite=self.overwrite)
 
 
-class Demo(Output):
+class Demo(Run):
     """Run all steps on the built-in city and write a report page."""
 
-    section = "start here"
     examples = ("mudg demo", "mudg demo --fast --out runs/first", "mudg demo --seed 7 --out city7")
-    short = ("device", "adaptation", "continue_fit")
+    source: Annotated[str, Flag(hidden=True)] = "city"
+    cameras: Annotated[tuple[str, ...], Flag(hidden=True)] = ()
     out: Annotated[Path, Flag()] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
     preset: PresetName | None = None
@@ -68,17 +68,3 @@ class Demo(Output):
     """The same as --preset fast, 3 m to each side: one to two minutes on 2 cores."""
     seed: Annotated[int | None, Flag("INT")] = None
     """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
-    shifts_m: tuple[float, ...] = ()
-    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize,
-    render and score."""
-    settings: RunConfig
-
-    @classmethod
-    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> RunConfig:
-        """As for mudg run."""
-        return Run.settings_from(inputs, file, given)
-
-    def act(self) -> dict[str, Any]:
-        from mudg.steps import pipeline
-
-        return pipeline.run_chain(self.settings, "city", self.out, overwrite=self.overwrite)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -14,6 +15,7 @@ from mudg.steps.step import SCENE, Flag
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
     from mudg.editing.view_settings import ScoreConfig
+    from mudg.steps.engine import Make
 
 _FILES = ("lpips_weights", "lpips_vgg_weights", "lpips_squeeze_weights", "fid_weights", "fvd_weights", "dino_weights", "clip_weights",
           "video_features", "detections", "lanes")  # fmt: skip
@@ -54,15 +56,12 @@ class Score(Output):
         fused = self.fused if self.settings.baseline else None
         return self.digests({"scene": self.scene, **self.views, "fused": fused, **files, "truth": self.truth})
 
-    def prepare(self, inputs: dict[str, str]) -> Any:
+    def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.base.devices import choose_device
-
-        choose_device(self.settings.device, "networks of the scores")
-
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
         from mudg.scoring import score
 
-        return score.write_scores(self.settings, self.scene, self.views, work.path, fused=self.fused, truth=self.truth)
+        choose_device(self.settings.device, "networks of the scores")
+        return partial(score.write_scores, self.settings, self.scene, self.views, fused=self.fused, truth=self.truth)
 
     def answer(self, outcome: Any) -> dict[str, Any]:
         from mudg.scoring import score
@@ -73,20 +72,17 @@ class Score(Output):
 class DrawTruth(Output):
     """Draw the truth of a generated city on some trajectories once, for many scores."""
 
+    verb_name = "truth"
     version, files = 2, below("*", (*OBSERVATION_FILES, "moving.safetensors"))
     scene: Path
     trajectories: tuple[Any, ...]
     """Each a `Trajectory`."""
 
-    @classmethod
-    def verb(cls) -> str:
-        return "truth"
-
     def key_settings(self) -> dict[str, Any]:
         views = [[v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width] for path in self.trajectories for v in path.views]
         return {"trajectories": [path.name for path in self.trajectories], "views": views}
 
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
+    def make(self, work: RunDir) -> dict[str, Any]:
         from mudg.scoring import truth as score_truth
 
         score_truth.write_truth(self.scene, self.trajectories, work.path)

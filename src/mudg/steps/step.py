@@ -53,6 +53,8 @@ class Step:
     text below a field is its help.
     """
 
+    verb_name: ClassVar[str] = ""
+    """Its name on the command line, where that is not the class's."""
     section: ClassVar[str] = ""
     examples: ClassVar[tuple[str, ...]] = ()
     smaller: ClassVar[str] = ""
@@ -61,6 +63,8 @@ class Step:
     """What the command calls the path that `run` returns."""
     short: ClassVar[tuple[str, ...]] = ()
     """Settings that `--help` lists; `--help-all` lists all. Empty: all."""
+    from_run: ClassVar[tuple[str, ...]] = ()
+    """Inputs that come from the run at `scene` where they are not given."""
     parts: ClassVar[Mapping[str, str]] = {}
     """First words that choose what the verb does, each with a page of help of its own, and what each does."""
     if typing.TYPE_CHECKING:
@@ -97,7 +101,7 @@ class Step:
 
     def required(self) -> tuple[str, ...]:
         """Inputs that come from the run at `scene` where they are not given."""
-        return ()
+        return self.from_run
 
     @classmethod
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -175,7 +179,7 @@ class Step:
     @classmethod
     def verb(cls) -> str:
         """Its name on the command line."""
-        return cls.__name__.lower()
+        return cls.verb_name or cls.__name__.lower()
 
     @classmethod
     def summary(cls) -> str:

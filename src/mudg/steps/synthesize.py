@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.layout import OBSERVATION_FILES, below
 from mudg.steps.engine import script_of
@@ -13,8 +13,8 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.base.run_folder import RunDir
     from mudg.diffusion.settings.synthesize import SynthesizeConfig
+    from mudg.steps.engine import Make
 
 
 class Synthesize(Output):
@@ -24,7 +24,9 @@ class Synthesize(Output):
     examples = ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",)
     smaller = "one process (--processes 1), smaller views (--width-px), fewer --cameras and --shifts-m"
     result = "views"
+    from_run = ("fused",)
     version, files = 2, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
+    idle = ("offload", "compiled")
     short = (
         "model",
         "cameras",
@@ -50,15 +52,12 @@ class Synthesize(Output):
     """Edit script (docs/edit.md): make views of the drive as it says."""
     settings: SynthesizeConfig
 
-    def required(self) -> tuple[str, ...]:
-        return ("fused",)
-
     def checked(self) -> Self:
         from mudg.diffusion.views import check_config
         from mudg.editing.generated import shows_weather
 
-        renders = self.fitted is not None
-        weather = self.edits is not None and shows_weather(self.settings, script_of(self.edits)[0], renders)
+        script, renders = script_of(self.edits), self.fitted is not None
+        weather = script is not None and shows_weather(self.settings, script, renders)
         return replace(self, settings=check_config(self.settings, renders, weather=weather))
 
     def reads(self) -> dict[str, Path | str | None]:
@@ -72,26 +71,16 @@ class Synthesize(Output):
         first = self.digests({"scene": self.scene, "fused": self.fused})
         return first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
 
-    def key_settings(self) -> dict[str, Any]:
-        """Without those that say how is computed, not what: a result may be resumed and reused under others."""
-        return {name: value for name, value in super().key_settings().items() if name not in ("offload", "compiled")}
-
-    def prepare(self, inputs: dict[str, str]) -> Any:
-        from mudg.diffusion.synthesize import JobInputs
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.diffusion.synthesize import JobInputs, write_views
         from mudg.editing.generated import edited_drive, edited_scene
         from mudg.gaussians.storage import model_of_scene
         from mudg.scene.read import read_scene
 
-        scene = read_scene(self.scene)
+        scene, script = read_scene(self.scene), script_of(self.edits)
         if self.fitted is not None:
             model_of_scene(self.fitted, scene)  # refuses the fit of another scene
         given = JobInputs(self.scene, cast("Path", self.fused), self.fitted)
-        if self.edits is None:
-            return given, scene
-        script = script_of(self.edits)[0]
-        return replace(given, edited=functools.partial(edited_drive, script)), edited_scene(script, self.settings, given, scene)
-
-    def make(self, work: RunDir, prepared: Any) -> dict[str, Any]:
-        from mudg.diffusion.synthesize import write_views
-
-        return write_views(self.settings, *prepared, work.path)
+        if script is not None:
+            scene, given = edited_scene(script, self.settings, given, scene), replace(given, edited=partial(edited_drive, script))
+        return partial(write_views, self.settings, given, scene)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 class ViewScene(Step):
     """Show a fitted scene in a browser, with exact frames from the rasterizer."""
 
+    verb_name = "view"
     section = "look at a drive"
     examples = ("mudg view runs/kitti", "mudg view runs/a runs/b", "mudg view runs/mudg_s --scene scenes/city --port 8080")
     source: Annotated[Path, RUN]
@@ -29,10 +30,6 @@ class ViewScene(Step):
     overwrite: bool = False
     """Save edits over a file that mudg view did not write."""
     settings: ViewConfig
-
-    @classmethod
-    def verb(cls) -> str:
-        return "view"
 
     def act(self) -> dict[str, Any]:
         from mudg.viewer import live as edits

@@ -22,6 +22,7 @@ from torch import Tensor
 from mudg import native
 from mudg.base import html, log, memory, store
 from mudg.base.errors import InputError
+from mudg.base.html import SENSES
 from mudg.base.processes import computed_ahead
 from mudg.base.records import understood
 from mudg.base.types import Observation
@@ -436,7 +437,7 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
     def y(value: float) -> float:
         return round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
 
-    better = f"{metric['better']} is better"
+    better = SENSES[metric["better"]]
     return {
         "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""), "better": better,
         "label": f"{metric['title']} over the lateral shift, {better}", "left": left, "right": right, "bottom": bottom,

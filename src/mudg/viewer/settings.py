@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class PageConfig:
     """What a viewer page holds."""
 
@@ -20,25 +17,25 @@ class PageConfig:
 
     method: str = ""
     """Fit of a run to show (empty = the best one: mudg_s, else street_gaussians)."""
-    budget: int = Field(default=3_000_000, ge=0)
+    budget: int = setting(default=3_000_000, ge=0)
     """Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and
     faintest are left out."""
-    memory_mb: int = Field(default=0, ge=0)
+    memory_mb: int = setting(default=0, ge=0)
     """Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit).
     Gaussians are left out as for the budget."""
-    images: int = Field(default=150, ge=0)
+    images: int = setting(default=150, ge=0)
     """Most recorded images on the page, taken evenly."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class ViewConfig(PageConfig):
     """What ``mudg view`` shows, and where."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"image_width_px": ("images", 640), "lidar_points": ("port", 20_000)}
 
-    budget: int = Field(default=0, ge=0)
+    budget: int = setting(default=0, ge=0)
     """Most Gaussians on the page (0 = all)."""
-    port: int = Field(default=0, ge=0, le=65535)
+    port: int = setting(default=0, ge=0, le=65535)
     """Port to listen on (0 = any free one)."""
     host: str = "127.0.0.1"
     """Address to listen on. Any other than this machine's own loopback needs --token."""
@@ -48,7 +45,7 @@ class ViewConfig(PageConfig):
     """Open the page in a browser where there is one."""
     exact: bool = True
     """Draw frames with the rasterizer when the camera rests."""
-    width_px: int = Field(default=1600, ge=16, le=8192)
+    width_px: int = setting(default=1600, ge=16, le=8192)
     """Widest exact frame, pixels."""
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""

@@ -48,7 +48,7 @@ from mudg.gaussians.rendering import COVERED
 from mudg.gaussians.settings import FitConfig, RadianceConfig
 from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
-from mudg.scene.read import read_points
+from mudg.scene.read import read_points, read_scene
 
 # rays -----------------------------------------------------------------------------------------------------------------
 #
@@ -399,10 +399,10 @@ class RadianceState:
         return {"parameters": count, "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def fit_radiance(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> dict[str, Any]:
+def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: RunDir) -> dict[str, Any]:
     """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns a summary."""
     with one_torch_thread(), memory_of(device, "fit"):
-        state = prepare(config, scene, folder, device)
+        state = prepare(config, read_scene(scene), folder, device)
         optimise(state, config, folder)
     budget = budget_of(config.radiance)
     write_preview(state.field, state.shown, budget, folder.path / "preview" / "final.png", whole=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -121,15 +121,13 @@ class PublishedLatents:
     """A batch of conditions as the network wants them.
 
     planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for the reference and
-    grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell that was seen; first
-    f32[B,4,h,w] colour of frame 0 as the points show it, without the reference, or None.
+    grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell that was seen.
     """
 
     planes: Tensor
     features: Tensor
     grey: Tensor
     seen: Tensor
-    first: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -239,8 +237,6 @@ class PublishedMDM(nn.Module):
         condition: Condition | Sequence[Condition],
         generator: torch.Generator | None = None,
         known: Tensor | None = None,
-        *,
-        points_first: bool = False,
     ) -> PublishedLatents:
         """Latents of the conditions of clips of one shape, and image features of their references (see `PublishedLatents`).
 
@@ -248,7 +244,6 @@ class PublishedMDM(nn.Module):
             generator: noise of the autoencoder's posterior; needed unless the configuration names its mean.
             known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
                 colour there (of every clip), frame 0 excepted.
-            points_first: also encode frame 0 without the reference (`PublishedLatents.first`).
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
         color, depth, valid, reference = (
@@ -268,7 +263,7 @@ class PublishedMDM(nn.Module):
         if known is not None:
             color = torch.cat([known.to(color).expand(len(color), -1, -1, -1, -1), color[:, len(known) :]], 1)
             seen = torch.cat([torch.ones_like(seen[:, : len(known)]), seen[:, len(known) :]], 1)
-        color, bare = torch.cat([first[:, None], color[:, 1:]], 1), color[:, :1]
+        color = torch.cat([first[:, None], color[:, 1:]], 1)
         seen = torch.cat([first_seen[:, None], seen[:, 1:]], 1)
         generator = self._posterior(generator)
         planes = torch.cat(
@@ -276,8 +271,7 @@ class PublishedMDM(nn.Module):
         )
         shown = torch.where(in_tokens, reference * 2 - 1, 0.0)
         features = self._features(torch.cat([shown, torch.zeros_like(reference[:1])]))
-        points_alone = self._encode(bare * 2 - 1, generator)[:, 0] if points_first else None
-        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen), points_alone)
+        return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
 
     def _features(self, images: Tensor) -> Tensor:
         """What the image tower, which lies on the CPU if `split` says so, makes of images on the model's device."""
@@ -342,7 +336,8 @@ class PublishedMDM(nn.Module):
         Raises:
             InputError: the clips' condition is not the published one.
         """
-        encoded, truths = [], []
+        encoded, truths, dropout = [], [], ContextDropout.for_reference(settings.reference_dropout)
+        *_, no_reference = self._batch_draws(part.count, seeds.torch_generator(part.seed, part.step, "noise"), dropout)
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
@@ -350,7 +345,8 @@ class PublishedMDM(nn.Module):
                         where=f"step {part.step}", expected="points alone, as the published-type model is given",
                         remedy="give another folder of clips; they are made anew")  # fmt: skip
                 draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
-                encoded.append(self.encode_condition(clip.condition, draws, points_first=settings.frame_dropout))
+                bare = settings.frame_dropout and bool(no_reference[number])
+                encoded.append(self.encode_condition(replace(clip.condition, reference_in="nowhere") if bare else clip.condition, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
@@ -359,10 +355,9 @@ class PublishedMDM(nn.Module):
                 "semantics": self._share_of_cells(classes),
             }
         planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
-        first = torch.cat([e.first for e in encoded]) if settings.frame_dropout else None  # type: ignore[misc]
         return self.velocity_loss(
-            truth, PublishedLatents(planes, features, encoded[0].grey, seen, first), seeds.torch_generator(part.seed, part.step, "noise"),
-            dropout=ContextDropout.for_reference(settings.reference_dropout), known=known, first=part.first, batch_clips=part.count,
+            truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
+            dropout=dropout, known=known, first=part.first, batch_clips=part.count,
         )  # fmt: skip
 
     forward = loss
@@ -387,8 +382,7 @@ class PublishedMDM(nn.Module):
 
         Args:
             truth: latents of `encode_truth`, each [B,T,4,h,w].
-            encoded: with `first`, a clip whose reference is left out has frame 0 without it too; else the image tokens alone go grey,
-                as in the released code.
+            encoded: where the reference is left out the image tokens go grey, as in the released code; frame 0 is as it was encoded.
             generator: of all draws: modality, noise step, noise, which context is left out, dropout inside the network.
             known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere.
             first: number of the first of these clips in the batch of a training step.
@@ -400,25 +394,18 @@ class PublishedMDM(nn.Module):
         """
         count = encoded.planes.shape[0]
         batch_clips, own = batch_clips or count, slice(first, first + count)
-        t = noise.stratified_steps(batch_clips, len(self.schedule), generator)[own].to(self.device)
-        drawn = _draw_modalities(batch_clips, generator)
+        steps, drawn, no_text, no_reference = self._batch_draws(batch_clips, generator, dropout)
+        t, no_text, no_reference = (draw[own].to(self.device) for draw in (steps, no_text, no_reference))
         names = drawn[own]
         x0 = torch.stack([truth[m][n] for n, m in enumerate(names)])
         seed, shape = generator.initial_seed(), (1, *x0.shape[1:])
         draws = [noise.video_noise(shape, seeds.torch_generator(seed, first + n, "noise")) for n in range(count)]
         eps = torch.cat(draws).to(self.device)
-        u = torch.rand(batch_clips, generator=generator)[own].to(self.device)
-        no_text = u < dropout.text + dropout.both
-        no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
-        planes, colors = encoded.planes, x0.shape[2]
-        if encoded.first is not None:
-            bare = torch.cat([encoded.first[:, None], planes[:, 1:, :colors]], 1)
-            planes = torch.where(no_reference.view(-1, 1, 1, 1, 1), torch.cat([bare, planes[:, :, colors:]], 2), planes)
         self._seed_dropout(seed, range(first, first + count))
         stated = self.predict(
-            self.schedule.add_noise(x0, eps, t), planes, t, names, text, self.image_tokens(features)
+            self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
         )
         squares = (stated - self.schedule.velocity(x0, eps, t)).square()
         if known:
@@ -427,6 +414,15 @@ class PublishedMDM(nn.Module):
         errors = squares.flatten(1).mean(1)
         sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in drawn}
         return Losses(errors.mean(), {m: total * batch_clips / (count * drawn.count(m)) for m, total in sums.items()})
+
+    def _batch_draws(
+        self, count: int, generator: torch.Generator, dropout: ContextDropout
+    ) -> tuple[Tensor, list[Modality], Tensor, Tensor]:
+        """Of the clips of a batch: noise steps i64[N], modalities, and bool[N] each: without the caption, without the reference."""
+        steps, names = noise.stratified_steps(count, len(self.schedule), generator), _draw_modalities(count, generator)
+        u = torch.rand(count, generator=generator)
+        no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
+        return steps, names, u < dropout.text + dropout.both, no_reference
 
     def _seed_dropout(self, seed: int, clips: range) -> None:
         layers = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class ConvertConfig:
     """Convert a published checkpoint to a model folder."""
 
@@ -26,6 +23,6 @@ class ConvertConfig:
     """Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights."""
     towers: str = ""
     """OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own)."""
-    memory_gb: float = Field(default=0.0, ge=0)
+    memory_gb: float = setting(default=0.0, ge=0)
     """Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 = derived from the
     file's size). Raise it if the conversion runs out of memory."""

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class HarmonizeConfig:
     """Where and how far a diffusion model changes the views of an edited scene."""
 
@@ -25,14 +22,14 @@ class HarmonizeConfig:
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
     Published-type models make views from noise: they take strengths of 0 and 1, and paths of at least 16 frames."""
-    steps: int = Field(default=2, ge=1, le=1000)
+    steps: int = setting(default=2, ge=1, le=1000)
     """Denoising steps. Use 50 for published-type models."""
-    uncovered: float = Field(default=1.0, ge=0, le=1)
+    uncovered: float = setting(default=1.0, ge=0, le=1)
     """How far the model may leave the render where something stood before, its shadow included: share of the noise schedule, 0 (it stays)
     to 1."""
-    objects: float = Field(default=0.0, ge=0, le=1)
+    objects: float = setting(default=0.0, ge=0, le=1)
     """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
-    weather: float = Field(default=0.0, ge=0, le=1)
+    weather: float = setting(default=0.0, ge=0, le=1)
     """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it. For published-type
     models alone, whose points and reference are edited."""
     seed: int = 0

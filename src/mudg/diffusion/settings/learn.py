@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import Limits, setting, settings
 from mudg.base.devices import DeviceName
 
-BelowOne = Annotated[float, Field(ge=0, lt=1)]
+BelowOne = Annotated[float, Limits(ge=0, lt=1)]
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnData:
     """Training clips: from recorded logs if `scenes` is given, else from generated cities."""
 
@@ -25,41 +22,41 @@ class LearnData:
         "label_confidence": ("depth", 0.5),
     }  # fmt: skip
 
-    width: int = Field(default=192, ge=32)
+    width: int = setting(default=192, ge=32)
     """Width of the training images in pixels."""
-    height: int = Field(default=128, ge=32)
+    height: int = setting(default=128, ge=32)
     """Height of the training images in pixels. For logs only the area width x height counts; the aspect ratio is the camera's."""
-    window: int = Field(default=8, ge=1)
+    window: int = setting(default=8, ge=1)
     """Frames per clip."""
     clips: str = ""
     """Folder of training clips to read; missing clips are added to it (empty = a folder inside the output). Give an earlier run's
     folder to reuse its clips. At an address such as s3://bucket/clips all clips must be there; they are fetched when needed."""
     augment: bool = True
     """Vary the training clips: change colours, mirror, and corrupt the classes in the condition."""
-    reference_dropout: float = Field(default=0.2, ge=0, le=1)
+    reference_dropout: float = setting(default=0.2, ge=0, le=1)
     """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released code:
     0.1)."""
     reference_dropout_scope: Literal["tokens", "tokens_and_frame"] = "tokens"
     """Published-type models: what such a clip lacks. tokens: the image tokens, as in the released code; frame 0 of the colour condition
     still shows the reference. tokens_and_frame: frame 0 shows points like all others, too, which the paper's sentence may mean."""
-    cities: int = Field(default=240, ge=1)
+    cities: int = setting(default=240, ge=1)
     """Number of generated cities to train on."""
-    skip_cities: int = Field(default=0, ge=0)
+    skip_cities: int = setting(default=0, ge=0)
     """Generated cities to leave out before the first one, for example those of an earlier run whose `clips` this run uses and adds to."""
-    first_cities: int = Field(default=40, ge=1)
+    first_cities: int = setting(default=40, ge=1)
     """Number of cities in use from the first step. The others are generated and join while training runs."""
-    all_cities_at: float = Field(default=0.6, ge=0, le=1)
+    all_cities_at: float = setting(default=0.6, ge=0, le=1)
     """Share of the steps after which all cities are in use, 0 to 1."""
-    clips_per_city: int = Field(default=4, ge=1)
+    clips_per_city: int = setting(default=4, ge=1)
     """Clips taken from each generated city."""
     realism: Literal["plain", "varied", "mixed"] = "plain"
     """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). mixed = half of them
     are. The small model then also learns five aspect ratios, all of about the area width x height. Cities for scoring stay plain."""
-    log_frames: int = Field(default=12, ge=12)
+    log_frames: int = setting(default=12, ge=12)
     """Generated cities: frames of each log. Longer logs, with fits of more steps, give better renders."""
-    side_cameras: float | None = Field(default=None, ge=0, le=1)
+    side_cameras: float | None = setting(default=None, ge=0, le=1)
     """Generated cities: share with two cameras beside the front one (not given: 0.4 of plain cities, 0.35 of varied ones)."""
-    fit_steps: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (100, 300)
+    fit_steps: tuple[Annotated[int, Limits(ge=1)], Annotated[int, Limits(ge=1)]] = (100, 300)
     """Generated cities: fewest and most steps of the fit to each city; cities for scoring have the middle of them."""
     renders: bool = True
     """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the condition, with patches
@@ -71,28 +68,28 @@ class LearnData:
     textures: str = ""
     """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use (empty =
     none)."""
-    held_out: int = Field(default=6, ge=1)
+    held_out: int = setting(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
     """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each. Or one list of many
     scenes, a file that ends in .yaml, .json or .txt (docs/training.md)."""
-    bad_scenes: float = Field(default=0.02, ge=0, le=1)
+    bad_scenes: float = setting(default=0.02, ge=0, le=1)
     """Scenes of a list: share that may be missing or damaged. These are named and left out; more end the training."""
     cameras: tuple[str, ...] = ()
     """Logs: cameras to take clips from (empty = all)."""
-    stride: int = Field(default=4, ge=1)
+    stride: int = setting(default=4, ge=1)
     """Logs: frames between the starts of two clips. Values below `window` give overlapping clips."""
-    held_out_every: int = Field(default=5, ge=0)
+    held_out_every: int = setting(default=5, ge=0)
     """Logs: every n-th clip is used for scoring only (0 = none)."""
     depth: Literal["annotated", "sweep"] = "annotated"
     """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's depth labels,
     weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
-    least_points: float | None = Field(default=None, gt=0, le=1)
+    least_points: float | None = setting(default=None, gt=0, le=1)
     """Logs: smallest share of the cloud's points in the condition of a training clip; the share is drawn between this and 1 (not given:
     0.3; published-type models: 1, all points, as in the paper)."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnNetwork:
     """Shape of the denoising network and of the refiner behind it."""
 
@@ -118,68 +115,68 @@ class LearnNetwork:
     """Residual blocks of the finisher at each level."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnCodec:
     """Training of the latent codec, which precedes the network's."""
 
-    steps: int = Field(default=400, ge=1)
+    steps: int = setting(default=400, ge=1)
     """Training steps of the codec's decoder."""
-    batch: int = Field(default=16, ge=1)
+    batch: int = setting(default=16, ge=1)
     """Images per step of the codec's decoder."""
-    fit_batches: int = Field(default=8, ge=1)
+    fit_batches: int = setting(default=8, ge=1)
     """Number of batches, of eight images each, to which the linear part of the codec is fitted."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnOptimizer:
     """AdamW, its learning-rate schedule, and the batch size."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weight_decay": ("clip_norm", 0.01)}
 
-    batch_frames: int = Field(default=16, ge=1)
+    batch_frames: int = setting(default=16, ge=1)
     """Frames per step over all processes. Steps use clips of half the window first, and whole windows at the end."""
-    full_window_share: float = Field(default=0.3, ge=0, le=1)
+    full_window_share: float = setting(default=0.3, ge=0, le=1)
     """Share of the steps, at the end, that use whole windows, 0 to 1."""
-    lr: float = Field(default=1e-3, gt=0)
+    lr: float = setting(default=1e-3, gt=0)
     """Largest learning rate. Use about a tenth of the default to fine-tune a trained model."""
-    warmup_steps: int = Field(default=100, ge=0)
+    warmup_steps: int = setting(default=100, ge=0)
     """Steps over which the learning rate rises to its largest value."""
-    decay_share: float = Field(default=0.5, gt=0, le=1)
+    decay_share: float = setting(default=0.5, gt=0, le=1)
     """Share of the steps, at the end, over which the learning rate falls."""
-    last_lr_share: float = Field(default=0.02, gt=0, le=1)
+    last_lr_share: float = setting(default=0.02, gt=0, le=1)
     """Learning rate of the last step, as a share of the largest one (1 = constant)."""
     betas: tuple[BelowOne, BelowOne] = (0.9, 0.99)
     """AdamW's decay rates of the mean gradient and of the mean squared gradient."""
-    clip_norm: float = Field(default=1.0, ge=0)
+    clip_norm: float = setting(default=1.0, ge=0)
     """Gradients with a larger norm than this are scaled down to it (0 = never)."""
-    average_decay: float = Field(default=0.998, ge=0, lt=1)
+    average_decay: float = setting(default=0.998, ge=0, lt=1)
     """Decay of the moving average of the weights, which is the result (0 = no average)."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnLoss:
     """Terms of the training loss."""
 
-    class_balance: float = Field(default=0.0, ge=0, le=1)
+    class_balance: float = setting(default=0.0, ge=0, le=1)
     """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The bias this
     gives the refiner's class scores is removed after training."""
-    refined_share: float = Field(default=0.5, gt=0, le=1)
+    refined_share: float = setting(default=0.5, gt=0, le=1)
     """The refiner is trained on a crop whose sides are this share of the image's."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnScore:
     """Scores and sample images of held-out clips."""
 
-    every: int = Field(default=400, ge=1)
+    every: int = setting(default=400, ge=1)
     """Steps between scorings during training."""
-    watched: int = Field(default=1, ge=1)
+    watched: int = setting(default=1, ge=1)
     """Number of held-out cities scored and drawn during training. At the end all are scored."""
-    steps: int = Field(default=2, ge=1)
+    steps: int = setting(default=2, ge=1)
     """Denoising steps of the scored samples."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnCompute:
     """How the training is computed and logged. These settings do not change the result; a run may be resumed with other
     values."""
@@ -190,35 +187,35 @@ class LearnCompute:
     parallel: Literal["ddp", "fsdp", "hsdp"] = "ddp"
     """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state over all processes; hsdp
     shards them within each node and keeps a replica on every node."""
-    processes_per_replica: int = Field(default=0, ge=0)
+    processes_per_replica: int = setting(default=0, ge=0)
     """hsdp: processes over which one replica is sharded (0 = the processes of a node)."""
-    accumulate: int = Field(default=1, ge=1)
+    accumulate: int = setting(default=1, ge=1)
     """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory and gives
     the same result."""
     recompute: bool = False
     """Activation checkpointing: recompute the activations of the network's blocks in the backward pass. Needs less memory, takes
     longer."""
-    workers: int = Field(default=1, ge=0)
+    workers: int = setting(default=1, ge=0)
     """Processes that generate clips of cities while training runs (0 = wait until another process has written them). Clips of
     logs are made before training starts, by this process if 0."""
-    checkpoint_every: int = Field(default=100, ge=1)
+    checkpoint_every: int = setting(default=100, ge=1)
     """Steps between checkpoints; an interrupted training resumes at the last one."""
-    checkpoints_kept: int = Field(default=2, ge=2)
+    checkpoints_kept: int = setting(default=2, ge=2)
     """Newest checkpoints to keep; older ones are removed."""
     cache: str = ""
     """Folder for training clips that are fetched or made when they are needed; several runs and processes may share it (empty = a folder
     inside the output)."""
-    cache_gb: float = Field(default=50.0, gt=0)
+    cache_gb: float = setting(default=50.0, gt=0)
     """Largest size of that folder in GB. The clips that were not used for the longest time are removed first."""
-    read_ahead: int = Field(default=4, ge=0)
+    read_ahead: int = setting(default=4, ge=0)
     """Steps ahead for which training clips are fetched or made (0 = none)."""
-    log_every: int = Field(default=50, ge=1)
+    log_every: int = setting(default=50, ge=1)
     """Steps between lines of log.jsonl."""
     tensorboard: bool = False
     """Also write the losses for TensorBoard (needs `pip install 'mudg[track]'`)."""
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class LearnConfig:
     """Train a multi-modal diffusion model on generated cities or on recorded logs."""
 
@@ -227,19 +224,19 @@ class LearnConfig:
     start: str = ""
     """Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from
     scratch)."""
-    steps: int = Field(default=2800, ge=1)
+    steps: int = setting(default=2800, ge=1)
     """Training steps of the network."""
     frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
     """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that
     mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
-    threads: int = Field(default=1, ge=1)
+    threads: int = setting(default=1, ge=1)
     """Threads of the training process. Results are repeatable for the same number of threads."""
-    data: LearnData = Field(default_factory=LearnData)
-    network: LearnNetwork = Field(default_factory=LearnNetwork)
-    codec: LearnCodec = Field(default_factory=LearnCodec)
-    optimizer: LearnOptimizer = Field(default_factory=LearnOptimizer)
-    loss: LearnLoss = Field(default_factory=LearnLoss)
-    score: LearnScore = Field(default_factory=LearnScore)
-    compute: LearnCompute = Field(default_factory=LearnCompute)
+    data: LearnData = setting(default_factory=LearnData)
+    network: LearnNetwork = setting(default_factory=LearnNetwork)
+    codec: LearnCodec = setting(default_factory=LearnCodec)
+    optimizer: LearnOptimizer = setting(default_factory=LearnOptimizer)
+    loss: LearnLoss = setting(default_factory=LearnLoss)
+    score: LearnScore = setting(default_factory=LearnScore)
+    compute: LearnCompute = setting(default_factory=LearnCompute)

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
 
@@ -29,12 +26,12 @@ class SynthesizeConfig:
     model: str = "embedded"
     """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or
     convert."""
-    steps: int = Field(default=2, ge=1, le=1000)
+    steps: int = setting(default=2, ge=1, le=1000)
     """Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type models."""
     sampler: Literal["ddim", "dpm_solver"] = "ddim"
     """Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
     deterministic, for many steps. Both cost one network pass per step."""
-    eta: float | None = Field(default=None, ge=0, le=1)
+    eta: float | None = setting(default=None, ge=0, le=1)
     """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
     1)."""
     condition: Literal["full", "reference", "points", "concat", "freevs", "repair"] = "full"
@@ -47,10 +44,10 @@ class SynthesizeConfig:
     """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
     align_depth: bool = True
     """Align generated depth to the LiDAR points in the same view (one scale and one shift per frame)."""
-    overlap: int = Field(default=2, ge=0)
+    overlap: int = setting(default=2, ge=0)
     """Frames that a window of the model shares with the previous window; they are kept, so that the video continues smoothly.
     Published-type models: 8."""
-    width_px: int = Field(default=0, ge=0)
+    width_px: int = setting(default=0, ge=0)
     """Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect ratio)."""
     full_size: bool = True
     """Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from warped recorded
@@ -60,14 +57,14 @@ class SynthesizeConfig:
     (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as in the release."""
     device: DeviceName = "auto"
     """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
-    processes: int = Field(default=0, ge=0)
+    processes: int = setting(default=0, ge=0)
     """Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type models, and where
     the diffusion model is not on the CPU)."""
-    guidance: float | None = Field(default=None, ge=1)
+    guidance: float | None = setting(default=None, ge=1)
     """Published-type models: scale of classifier-free guidance; 1 = none, which halves the work (not given: 7.5)."""
-    guidance_rescale: float | None = Field(default=None, ge=0, le=1)
+    guidance_rescale: float | None = setting(default=None, ge=0, le=1)
     """Published-type models: guidance rescale, 0 (off) to 1; limits overexposure by guidance (not given: 0.7)."""
-    memory_budget_gb: float = Field(default=0.0, ge=0)
+    memory_budget_gb: float = setting(default=0.0, ge=0)
     """Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device; elsewhere do not split).
     The result stays the same."""
     offload: bool = False

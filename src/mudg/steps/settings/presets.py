@@ -6,11 +6,11 @@ Precedence: defaults < preset < ``--config`` < flags. Every preset is a configur
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Final, Literal, get_args
 
+from mudg.base.config import changed
 from mudg.base.errors import UsageError
-from mudg.steps.settings.run import RunConfig, with_lines
+from mudg.steps.settings.run import RunConfig
 
 PresetName = Literal["fast", "default", "quality", "paper"]
 
@@ -68,8 +68,8 @@ def run_preset(name: PresetName = "default") -> RunConfig:
     """
     if name not in PRESETS:
         raise UsageError("no such preset", where="--preset", expected=", ".join(get_args(PresetName)), got=repr(name))
-    config = _with(with_lines(RunConfig(), cameras=()), {"ingest.city.seed": DEMO_CITY})
-    return _with(config, PRESETS[name])
+    own = {"ingest.city.seed": DEMO_CITY, "synthesize.cameras": (), "render.cameras": ()}
+    return _with(RunConfig(), {**own, **PRESETS[name]})
 
 
 def chosen_preset(name: PresetName | None, fast: bool) -> PresetName:
@@ -91,4 +91,4 @@ def _with(config: Any, values: Mapping[str, Any]) -> Any:
             groups.setdefault(group, {})[rest] = value
         else:
             own[key] = value
-    return replace(config, **own, **{name: _with(getattr(config, name), inner) for name, inner in groups.items()})
+    return changed(config, own | {name: _with(getattr(config, name), inner) for name, inner in groups.items()})

@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, Literal
 
-from pydantic import Field
-from pydantic.dataclasses import dataclass
-
-from mudg.base.config import STRICT
+from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 from mudg.diffusion.settings.adapt import AdaptConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
@@ -19,7 +16,7 @@ from mudg.labels.settings import AnnotateConfig
 from mudg.scene.settings import FuseConfig
 
 
-@dataclass(frozen=True, kw_only=True, config=STRICT)
+@settings
 class RunConfig:
     """Settings of all steps, in one group per step."""
 
@@ -31,19 +28,19 @@ class RunConfig:
     that one."""
     continue_fit: bool = True
     """Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published."""
-    ingest: IngestConfig = Field(default_factory=IngestConfig)
-    annotate: AnnotateConfig = Field(default_factory=AnnotateConfig)
-    fuse: FuseConfig = Field(default_factory=FuseConfig)
-    adapt: AdaptConfig = Field(default_factory=AdaptConfig)
-    synthesize: SynthesizeConfig = Field(default_factory=SynthesizeConfig)
-    fit: FitConfig = Field(default_factory=FitConfig)
-    render: RenderConfig = Field(default_factory=RenderConfig)
-    score: ScoreConfig = Field(default_factory=ScoreConfig)
+    ingest: IngestConfig = setting(default_factory=IngestConfig)
+    annotate: AnnotateConfig = setting(default_factory=AnnotateConfig)
+    fuse: FuseConfig = setting(default_factory=FuseConfig)
+    adapt: AdaptConfig = setting(default_factory=AdaptConfig)
+    synthesize: SynthesizeConfig = setting(default_factory=SynthesizeConfig)
+    fit: FitConfig = setting(default_factory=FitConfig)
+    render: RenderConfig = setting(default_factory=RenderConfig)
+    score: ScoreConfig = setting(default_factory=ScoreConfig)
 
 
 def with_seed(config: RunConfig, seed: int) -> RunConfig:
     """The same settings with ``seed`` in every verb that draws random numbers."""
-    parts = {f.name: part for f in fields(config) if is_dataclass(part := getattr(config, f.name))}  # type: ignore[arg-type]
+    parts: dict[str, Any] = {f.name: part for f in fields(config) if is_dataclass(part := getattr(config, f.name))}
     seeded = {n: replace(p, seed=seed) for n, p in parts.items() if any(f.name == "seed" for f in fields(p))}
     seeded["ingest"] = replace(config.ingest, city=replace(config.ingest.city, seed=seed))
     return replace(config, **seeded)
@@ -66,6 +63,8 @@ def with_lines(
 
     Render always adds the recorded path, synthesize leaves it out.
     """
+    if cameras is None and shifts_m is None:
+        return config
     synthesize, render = config.synthesize, config.render
     if cameras is not None:
         synthesize, render = replace(synthesize, cameras=cameras), replace(render, cameras=cameras)

@@ -1,0 +1,243 @@
+"""The engine: what holds for every verb that makes a folder or a file, whatever it makes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import pytest
+from toy_fitted import write_toy_run
+
+from mudg import app, steps
+from mudg.base import store
+from mudg.base.errors import InputError, IntegrityError, UsageError
+from mudg.base.run_folder import RunDir
+from mudg.fleet.verbs import stage_lines
+from mudg.steps.command import parse, words_of
+from mudg.steps.engine import Make, Result, paths_of
+from mudg.steps.outputs import Output
+from mudg.steps.step import Flag
+
+LINES = {
+    "annotate": "annotate TOY/scene", "fuse": "fuse TOY/scene", "fit": "fit TOY/scene --fused TOY/fuse --observations TOY/views",
+    "synthesize": "synthesize TOY/scene --fused TOY/fuse --fitted TOY/fit --edits TOY/edits.yaml",
+    "adapt": "adapt TOY/scene --fused TOY/fuse --fitted TOY/fit", "render": "render TOY/scene --model TOY/fit --edits TOY/edits.yaml",
+    "score": "score TOY/scene --views a=TOY/views b=TOY/more --fused TOY/fuse", "edit": "edit TOY/fit TOY/edits.yaml --scene TOY/scene",
+    "export": "export colmap TOY/fit --scene TOY/scene --edits TOY/edits.yaml",
+    "asset export": "asset export TOY/fit car-001 --scene TOY/scene", "asset import": "asset import TOY/edits.yaml --kind scene",
+    "ingest": "ingest TOY/scene",
+}  # fmt: skip
+"""A command line of every verb whose result has inputs."""
+ANSWERS = """
+import contextlib, io, json, sys
+from mudg import app
+for line in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = app.main(line.split())
+    print(json.dumps([code, said.getvalue(), "torch" in sys.modules]))
+"""
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene, clouds, a fit, views and a script."""
+    root = tmp_path_factory.mktemp("toy")
+    write_toy_run(root)
+    store.write_json(root / "fuse" / "fuse.json", {})
+    for name in ("views", "more"):
+        store.write_json(root / name / "observations.json", {})
+    (root / "edits.yaml").write_text("- remove: {ids: [car]}\n")
+    return root
+
+
+def inputs_in(line: str) -> list[str]:
+    """Paths that a command line names."""
+    return [word.partition("=")[2] or word for word in line.split() if "TOY" in word]
+
+
+def test_every_result_with_inputs_is_tried_below() -> None:
+    classes = {verb: steps.step_class(verb) for verb in steps.VERBS}
+    assert {verb for verb, cls in classes.items() if issubclass(cls, Result) and cls.prepare is not Result.prepare} == LINES.keys()
+
+
+def test_a_wrong_path_is_refused_before_torch_loads_whatever_the_verb(toy: Path, tmp_path: Path) -> None:
+    wrong = [line.replace(path, f"{path}x") for line in LINES.values() for path in inputs_in(line)]
+    told = [f"{line.replace('TOY', str(toy))} --out {tmp_path / 'out.safetensors'}" for line in wrong]
+    done = subprocess.run([sys.executable, "-c", ANSWERS, json.dumps(told)], capture_output=True, text=True, check=True)
+    for line, answer in zip(wrong, done.stdout.splitlines(), strict=True):
+        code, said, torch_loaded = json.loads(answer)
+        assert code == InputError.exit_code and str(toy) in said, (line, said)
+        assert not torch_loaded, f"{line}: torch was loaded"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", LINES)
+def test_an_output_that_touches_an_input_is_refused(verb: str, toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in toy.rglob("*")}
+    for path in inputs_in(LINES[verb]):
+        for out in (path, f"{path}/inside") if not path.endswith(".yaml") else (path,):
+            line = f"{LINES[verb]} --overwrite --out {out}".replace("TOY", str(toy))
+            assert app.main([*line.split()]) == UsageError.exit_code, line
+            assert "an input" in capsys.readouterr().err or verb == "asset export", line
+    assert {path: path.stat().st_mtime_ns for path in toy.rglob("*")} == before
+
+
+@pytest.mark.parametrize("line", [*LINES.values(), "ingest city --city.seed 7 --no-contact-sheet", "run city --fast --seed 4"])
+def test_the_words_of_a_step_are_read_as_the_same_step(line: str) -> None:
+    words = line.split()
+    verb, rest = app.find_verb([*words, "--out", "OUT"])
+    step = parse(steps.step_class(verb), rest)[0]
+    again = words_of(step)
+    assert parse(steps.step_class(verb), [*again[len(verb.split(" ")) :], "--out", "OUT"])[0] == step
+
+
+def test_steps_of_batches_say_only_what_their_settings_do_not() -> None:
+    assert stage_lines()["fit"] == ("fit", "{scene}", "--fused", "{fuse}", "--method", "street_gaussians")
+    assert stage_lines()["score"] == ("score", "{scene}", "--fused", "{fuse}", "--views", "fit={render}")
+
+
+# ---- a step that writes one line of each input ---------------------------------------------------------------------------
+
+
+class Lines(Output):
+    """Write the texts of files, a file a time."""
+
+    version, files = 1, ("*.txt", "begun/")
+    first: Annotated[Path, Flag("FILE", "first")]
+    more: tuple[Path, ...] = ()
+    views: Any = None
+    end: str = ""
+    stop: Any = None
+    """Called before every file."""
+
+    def checked(self) -> Lines:
+        """Refuses one end."""
+        if self.end == "wrong":
+            raise UsageError("no such end")
+        return self
+
+    def key_settings(self) -> dict[str, Any]:
+        """The end alone."""
+        return {"end": self.end}
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        """Refuses an empty file."""
+        texts = [path.read_text() for path in (self.first, *self.more)]
+        if "" in texts:
+            raise InputError("an empty file")
+        return partial(self.written, texts)
+
+    def written(self, texts: list[str], work: RunDir) -> dict[str, Any]:
+        """Go on after the last file that is there."""
+        for number, text in enumerate(texts):
+            if not (work.path / f"{number}.txt").is_file():
+                (self.stop or str)(number)
+                store.write_text(work.path / f"{number}.txt", text + self.end)
+        return {"files": len(texts)}
+
+
+@pytest.fixture
+def lines(tmp_path: Path) -> Lines:
+    """Two files as inputs."""
+    for name in ("a", "b"):
+        (tmp_path / name).write_text(name)
+    return Lines(first=tmp_path / "a", more=(tmp_path / "b",), out=tmp_path / "out")
+
+
+def test_a_finished_result_is_reused_and_names_what_it_was_made_of(lines: Lines, tmp_path: Path) -> None:
+    assert lines.run() == tmp_path / "out"
+    record = store.read_json(tmp_path / "out" / "run.json")
+    assert (record["verb"], record["state"], record["summary"], record["files"]) == ("lines", "complete", {"files": 2}, ["*.txt", "begun/"])
+    assert record["inputs"] == {"first": store.digest(tmp_path / "a"), "more": store.digest(tmp_path / "b")}
+    replace(lines, stop=pytest.fail).run()
+    with pytest.raises(UsageError, match="end: '' there, '!' asked"):
+        replace(lines, end="!").run()
+    (tmp_path / "b").write_text("other")
+    with pytest.raises(UsageError, match="input 'more' changed"):
+        lines.run()
+    (tmp_path / "b").write_text("b")
+    (tmp_path / "out" / "1.txt").write_text("altered")
+    with pytest.raises(IntegrityError):
+        lines.run()
+
+
+def test_another_result_is_replaced_only_on_demand_and_only_when_the_new_one_is_finished(lines: Lines, tmp_path: Path) -> None:
+    lines.run()
+
+    def interrupted(number: int) -> None:
+        assert (tmp_path / "out" / "0.txt").read_text() == "a"
+        if number == 1:
+            raise KeyboardInterrupt
+
+    other = replace(lines, end="!", overwrite=True)
+    with pytest.raises(KeyboardInterrupt):
+        replace(other, stop=interrupted).run()
+    assert (tmp_path / "out" / "0.txt").read_text() == "a"
+    numbers: list[int] = []
+    replace(other, stop=numbers.append).run()
+    assert numbers == [1], "what the interrupted run made is taken"
+    assert [(tmp_path / "out" / f"{n}.txt").read_text() for n in (0, 1)] == ["a!", "b!"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "out"]
+
+
+def test_an_interrupted_step_says_so_lets_go_and_goes_on(lines: Lines, tmp_path: Path) -> None:
+    def interrupted(number: int) -> None:
+        if number == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        replace(lines, stop=interrupted).run()
+    assert store.read_json(tmp_path / "out" / "run.json")["state"] == "interrupted"
+    assert not (tmp_path / "out" / "lock").exists()
+    numbers: list[int] = []
+    replace(lines, stop=numbers.append).run()
+    assert numbers == [1]
+
+
+def test_what_cannot_be_done_is_refused_before_anything_is_written(lines: Lines, tmp_path: Path) -> None:
+    (tmp_path / "empty").write_text("")
+    for change, error in (
+        ({"end": "wrong"}, UsageError), ({"first": tmp_path / "none"}, InputError), ({"more": (tmp_path / "none",)}, InputError),
+        ({"first": tmp_path / "empty"}, InputError), ({"out": tmp_path / "a"}, UsageError), ({"out": tmp_path}, UsageError),
+    ):  # fmt: skip
+        with pytest.raises(error):
+            replace(lines, **change).run()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "empty"]
+
+
+def test_inputs_are_the_fields_that_hold_paths(lines: Lines, tmp_path: Path) -> None:
+    several = replace(lines, more=(tmp_path / "b", tmp_path / "a"))
+    assert paths_of(several) == {"first": tmp_path / "a", "more": tmp_path / "b", "more 1": tmp_path / "a"}
+    assert {field.name for field in fields(lines)} >= {"out", "overwrite", "first"}
+
+
+class OneFile(Lines):
+    """The same in one file."""
+
+    @property
+    def is_file(self) -> bool:
+        """Yes."""
+        return True
+
+    def written(self, texts: list[str], work: Any) -> dict[str, Any]:
+        """All texts."""
+        (self.stop or str)(0)
+        store.write_text(work.path, "".join(texts))
+        return {"files": len(texts)}
+
+
+def test_a_result_may_be_one_file_with_a_description(lines: Lines, tmp_path: Path) -> None:
+    one = OneFile(first=lines.first, more=lines.more, out=tmp_path / "one.txt")
+    assert one.run().read_text() == "ab"
+    about = store.read_json(tmp_path / "one.txt.json")
+    assert (about["verb"], about["files"], about["sha256"]) == ("onefile", 2, store.digest(tmp_path / "one.txt"))
+    assert about["inputs"] == {"first": store.digest(tmp_path / "a"), "more": store.digest(tmp_path / "b")}
+    replace(one, stop=pytest.fail).run()
+    with pytest.raises(UsageError):
+        replace(one, end="!").run()
+    assert replace(one, end="!", overwrite=True).run().read_text() == "ab"
