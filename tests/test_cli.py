@@ -11,8 +11,9 @@ import pytest
 from mudg import app
 from mudg.base import config as configuration
 from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
-from mudg.steps import settings as stage_config
 from mudg.steps.doctor import Doctor
+from mudg.steps.settings.presets import run_preset
+from mudg.steps.settings.run import with_seed
 
 
 def parse(*words: str) -> Any:
@@ -41,7 +42,7 @@ def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> No
     assert args.settings.fit.iterations == 77
     assert args.settings.fit.start.voxel_m == 0.25
     assert args.settings.fit.start.gaussians == 90
-    fast, full = stage_config.run_preset("fast"), stage_config.run_preset()
+    fast, full = run_preset("fast"), run_preset()
     assert args.settings.synthesize == fast.synthesize != full.synthesize
     assert args.settings.ingest == fast.ingest
 
@@ -57,7 +58,7 @@ def test_the_seed_goes_to_every_verb_that_draws() -> None:
 
 def test_a_seed_on_the_command_line_beats_the_file(tmp_path: Path) -> None:
     file = tmp_path / "run.yaml"
-    file.write_text(configuration.dump_yaml(stage_config.with_seed(stage_config.run_preset(), 3)))
+    file.write_text(configuration.dump_yaml(with_seed(run_preset(), 3)))
     assert parse("demo", "--config", str(file)).settings.fit.seed == 3
     assert parse("demo", "--config", str(file), "--seed", "4").settings.fit.seed == 4
 

@@ -13,10 +13,9 @@ from mudg import app
 from mudg.base import config as configuration
 from mudg.base.errors import InputError, UsageError
 from mudg.steps import pipeline
-from mudg.steps import settings as stage_config
 from mudg.steps.run import Run
-from mudg.steps.settings.presets import PRESETS, PresetName, run_preset
-from mudg.steps.settings.run import RunConfig
+from mudg.steps.settings.presets import DEMO_CITY, PRESETS, PresetName, run_preset
+from mudg.steps.settings.run import RunConfig, with_seed
 
 NAMES = get_args(PresetName)
 
@@ -42,7 +41,7 @@ def test_a_preset_is_its_row_over_the_defaults(name: PresetName) -> None:
         assert value_of(config, key) == value, key
     back = configuration.load(RunConfig, None, None, configuration.to_dict(config))  # every value passes its check
     assert back == config
-    assert config.ingest.city.seed == stage_config.DEMO_CITY
+    assert config.ingest.city.seed == DEMO_CITY
     assert config.synthesize.cameras == config.render.cameras == ()
     assert words("--preset", name) == config
 
@@ -115,7 +114,7 @@ def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.Monkey
     mudg.run("city", out=tmp_path, seed=4)
     assert seen[0] == replace(run_preset("quality"), fit=replace(run_preset("quality").fit, iterations=9))
     assert seen[1] == run_preset("fast")
-    assert seen[2] == stage_config.with_seed(run_preset(), 4)
+    assert seen[2] == with_seed(run_preset(), 4)
     with pytest.raises(UsageError, match="another name of --preset fast"):
         mudg.run("city", out=tmp_path, preset="paper", fast=True)
 

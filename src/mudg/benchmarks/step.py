@@ -48,9 +48,9 @@ class Bench(Output):
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> BenchConfig:
         """Preset, then the file, then single settings."""
         from mudg.base import config as configuration
-        from mudg.steps import settings as c
+        from mudg.benchmarks.settings import BenchConfig, bench_preset
 
-        return configuration.load(c.BenchConfig, c.bench_preset(inputs["preset"]), file, given)
+        return configuration.load(BenchConfig, bench_preset(inputs["preset"]), file, given)
 
     @classmethod
     def applies(cls, part: str, name: str, text: str) -> bool:

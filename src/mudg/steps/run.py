@@ -40,12 +40,13 @@ class Run(Output):
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> RunConfig:
         """Preset, then the file, then seed, cameras and shifts, then settings of single steps."""
         from mudg.base import config as configuration
-        from mudg.steps import settings as c
+        from mudg.steps.settings.presets import chosen_preset, run_preset
+        from mudg.steps.settings.run import RunConfig, with_lines, with_seed
 
-        made = configuration.load(c.RunConfig, c.run_preset(c.chosen_preset(inputs["preset"], inputs["fast"])), file)
-        made = made if inputs["seed"] is None else c.with_seed(made, inputs["seed"])
-        made = c.with_lines(made, cameras=inputs.get("cameras") or None, shifts_m=inputs["shifts_m"] or None)
-        return configuration.load(c.RunConfig, made, None, given)
+        config = configuration.load(RunConfig, run_preset(chosen_preset(inputs["preset"], inputs["fast"])), file)
+        config = config if inputs["seed"] is None else with_seed(config, inputs["seed"])
+        config = with_lines(config, cameras=inputs.get("cameras") or None, shifts_m=inputs["shifts_m"] or None)
+        return configuration.load(RunConfig, config, None, given)
 
     def act(self) -> dict[str, Any]:
         from mudg.steps import pipeline

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import pkgutil
 import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -194,12 +195,9 @@ class _Settings(dict[str, Any]):
     """Names that annotations of steps use and that only type checkers import: classes of settings, looked up when needed."""
 
     def __missing__(self, name: str) -> Any:
-        from mudg.steps import settings as config
+        from mudg.steps.settings import HOMES
 
-        try:
-            return getattr(config, name)
-        except AttributeError:
-            raise KeyError(name) from None
+        return pkgutil.resolve_name(HOMES[name])
 
 
 @functools.cache
