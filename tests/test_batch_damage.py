@@ -13,8 +13,9 @@ import pytest
 from test_batches import Scenes
 
 from mudg.base.errors import MudgError
-from mudg.fleet import batch, status
+from mudg.fleet import status
 from mudg.fleet.work import facts_of, peak_of
+from mudg.steps import batching
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,7 @@ def test_damaged_records_of_a_batch_end_in_words(kind: str, made: Path, tmp_path
         ends_in_words(all_of_it)
         ends_in_words(drive)
         if tried % 25 == 0:
-            ends_in_words(lambda: batch.retry(str(out)))
+            ends_in_words(lambda: batching.retry(str(out)))
             ends_in_words(scenes.run)
             shutil.rmtree(out)
             shutil.copytree(made, out)

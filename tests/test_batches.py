@@ -19,14 +19,15 @@ import pytest
 from mudg import app
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
-from mudg.fleet import batch, engines, status, work
+from mudg.fleet import engines, status, work
 from mudg.fleet.child import Stop, last_words, run_step
 from mudg.fleet.engines import LocalRun
 from mudg.fleet.plan import BatchPlan, BatchStage, Entry, command_of, parse_shard, plan_of, read_list, shard_of
 from mudg.fleet.records import BatchFolder, Ended, this_host
 from mudg.fleet.settings import BatchConfig
-from mudg.fleet.verbs import stage_lines
 from mudg.fleet.work import Job, facts_of
+from mudg.steps import batching
+from mudg.steps.batch import stage_lines
 from mudg.steps.settings.run import RunConfig
 
 STEP = """
@@ -210,7 +211,7 @@ def test_exit_codes_decide_how_often_a_step_is_tried(tmp_path: Path, code: int, 
     assert made.batch.log(record.key).load() == b"error: it broke\n"
     made.does("s0", "")
     assert made.run() == {}, "what has failed stays so"
-    assert batch.retry(str(made.batch.out), str(code))["forgotten"] == 1
+    assert batching.retry(str(made.batch.out), str(code))["forgotten"] == 1
     assert made.run() == {"done": 1}
     (path,) = (tmp_path / "out/s0/command").iterdir()
     assert [file.name for file in path.iterdir()] == ["x.txt"], "nothing is left of the failure"
@@ -547,17 +548,17 @@ def test_failures_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFi
     assert app.main(["batch", "retry", str(tmp_path / "out"), "--reason", "5,3"]) == 0
     assert app.main(made.words()) == 0 and made.runs() == {"s0": 1, "s1": 2, "s2": 1, "s3": 1}
     with pytest.raises(InputError, match="no batch"):
-        batch.retry(str(tmp_path / "elsewhere"))
+        batching.retry(str(tmp_path / "elsewhere"))
 
 
 def test_paths_in_settings_are_made_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "models/net").mkdir(parents=True)
-    settings = batch.settings_of("default", None, ["annotate.weights=models/net", "fit.iterations=5"])
+    settings = batching.settings_of("default", None, ["annotate.weights=models/net", "fit.iterations=5"])
     assert settings.fit.iterations == 5
-    plan = batch.plan_for(BatchConfig(stages=("ingest", "annotate")), settings, LINES)
+    plan = batching.plan_for(BatchConfig(stages=("ingest", "annotate")), settings, LINES)
     assert plan.stages[1].settings["weights"] == str(tmp_path / "models/net")
-    assert batch.plan_for(BatchConfig(), RunConfig(), LINES).stages[0].name == "run"
+    assert batching.plan_for(BatchConfig(), RunConfig(), LINES).stages[0].name == "run"
 
 
 # ---- templates for schedulers -------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from mudg import app, steps
 from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.run_folder import RunDir
-from mudg.fleet.verbs import stage_lines
+from mudg.steps.batch import stage_lines
 from mudg.steps.command import parse, words_of
 from mudg.steps.engine import Make, Result, paths_of
 from mudg.steps.outputs import Output

@@ -28,9 +28,9 @@ _HOMES: Final[Mapping[str, str]] = {
     "asset export": "mudg.steps.asset:AssetExport",
     "asset import": "mudg.steps.asset:AssetImport",
     "export": "mudg.steps.export:Export",
-    "batch run": "mudg.fleet.verbs:BatchRun",
-    "batch status": "mudg.fleet.verbs:BatchProgress",
-    "batch retry": "mudg.fleet.verbs:BatchRetry",
+    "batch run": "mudg.steps.batch:BatchRun",
+    "batch status": "mudg.steps.batch:BatchProgress",
+    "batch retry": "mudg.steps.batch:BatchRetry",
     "bench": "mudg.benchmarks.step:Bench",
     "convert": "mudg.steps.convert:Convert",
 }

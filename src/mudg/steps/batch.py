@@ -65,13 +65,13 @@ class BatchRun(Step):
         return super().settings_from(inputs, None, given)
 
     def act(self) -> dict[str, Any]:
-        from mudg.fleet import batch
+        from mudg.steps import batching
 
-        settings = batch.settings_of(self.preset, self.config, self.set)
-        request = batch.BatchRequest(
+        settings = batching.settings_of(self.preset, self.config, self.set)
+        request = batching.BatchRequest(
             self.list, self.out, self.settings, settings, stage_lines(), self.shard, self.wait, self.scratch, self.take_over
         )
-        return batch.run(request, self.dry_run)
+        return batching.run(request, self.dry_run)
 
 
 def stage_lines() -> dict[str, tuple[str, ...]]:
@@ -104,9 +104,9 @@ class BatchProgress(Step):
     """Price of one core-hour."""
 
     def act(self) -> dict[str, Any]:
-        from mudg.fleet import batch
+        from mudg.steps import batching
 
-        return batch.show_status(self.out, self.html, self.price, self.watch_s)
+        return batching.show_status(self.out, self.html, self.price, self.watch_s)
 
 
 class BatchRetry(Step):
@@ -121,6 +121,6 @@ class BatchRetry(Step):
     """Only these exit codes or reasons, with commas, e.g. 5,137 (empty = all)."""
 
     def act(self) -> dict[str, Any]:
-        from mudg.fleet import batch
+        from mudg.steps import batching
 
-        return batch.retry(self.out, self.reason)
+        return batching.retry(self.out, self.reason)
