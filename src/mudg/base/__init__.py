@@ -1,1 +1,1 @@
-"""Floor 1: the words of the package. Types, geometry, seeds, errors, configuration and the on-disk store."""
+"""The words of the package: types, geometry, seeds, errors, configuration and the on-disk store."""

@@ -1,1 +1,1 @@
-"""Floor 2: pure tensor functions. No files, no configuration loading, no parameters."""
+"""Pure tensor functions. No files, no configuration loading, no parameters."""
