@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.steps.engine import script_of
+from mudg.steps.engine import Make, script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.diffusion.settings.synthesize import SynthesizeConfig
-    from mudg.steps.engine import Make
 
 
 class Synthesize(Output):
@@ -74,5 +73,5 @@ class Synthesize(Output):
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.steps import synthesis as synthesize
 
-        given = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script_of(self.edits))
-        return partial(synthesize.write_views, self.settings, given, synthesize.read_drive(self.settings, given))
+        job = synthesize.JobInputs(self.scene, cast("Path", self.fused), self.fitted, script_of(self.edits))
+        return partial(synthesize.write_views, self.settings, job, synthesize.read_drive(self.settings, job))
