@@ -6,6 +6,7 @@ Cases that a format's own test has are not repeated; docs/ingest.md lists them a
 from __future__ import annotations
 
 import copy
+import gzip
 import io
 import shutil
 import sqlite3
@@ -22,9 +23,11 @@ import write_dgp
 import write_nuscenes
 import write_waymo
 from bad_logs import NEEDS_PYARROW, Change
+from pandas_pickles import frame_bytes, write_frame
 from roundtrip import needs_native
 
 from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.pandaset import gunzip, parse_frame, read_frame
 
 pytestmark = needs_native
 
@@ -108,6 +111,28 @@ def test_a_missing_cloud_is_refused_where_the_log_names_it(folder: Path, tmp_pat
     assert "lidar lacks 1" in error.got
 
 
+def brighter(columns: int) -> Change:
+    """Rows of float32 whose fourth value is of another scale."""
+    scale = np.array([1, 1, 1, 300, 1][:columns])
+    return lambda content: (np.frombuffer(content, "<f4").reshape(-1, columns) * scale).astype("<f4").tobytes()
+
+
+def brighter_frame(content: bytes) -> bytes:
+    columns = parse_frame(gunzip(content, "i"), "i")
+    return gzip.compress(frame_bytes({**columns, "i": columns["i"] * 300}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [("kitti", brighter(4)), ("kitti360", brighter(4)), ("nuscenes", brighter(5)), ("pandaset", brighter_frame)],
+)
+def test_intensities_of_another_scale_are_refused_not_clipped(kind: str, change: Change, folder: Path, tmp_path: Path) -> None:
+    log = written(kind, folder)
+    with bad_logs.damaged(log, kind, "cloud", change, tmp_path) as (source, where):
+        error = bad_logs.assert_refused(kind, source, tmp_path, bad_logs.options_of(log), "intensity is out of range", where)
+    assert error.remedy
+
+
 # --- Waymo, both forms -------------------------------------------------------------------------------------------------------
 
 
@@ -134,8 +159,15 @@ class Lying(np.ndarray):
         return (1 << 20, *super().shape[1:])
 
 
+def long_ids(log: write_waymo.Log) -> None:
+    for frame in log.frames:
+        for box in frame["boxes"]:
+            box["id"] = "n" * 201
+
+
 WAYMO: dict[str, tuple[Callable[[write_waymo.Log], None], str]] = {
     "width and length swapped": (swap_sides, "length and width of boxes are swapped"),
+    "id of 201 letters": (long_ids, "name is too long"),
     "range image declares more than it holds": (lying_shape, "wrong shape"),
 }
 
@@ -215,6 +247,27 @@ def dgp(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path
     return lambda root: write_dgp.edit(root / file, lambda record: [change(record), None][1])
 
 
+LONG = "n" * 201
+
+
+def text(pattern: str, old: str, new: str) -> Callable[[Path], None]:
+    """Replaces a text in the one file that fits the pattern."""
+
+    def spoil(root: Path) -> None:
+        (path,) = root.glob(pattern)
+        content = path.read_text()
+        assert old in content
+        path.write_text(content.replace(old, new))
+
+    return spoil
+
+
+def long_labels(root: Path) -> None:
+    for path in root.glob("001/annotations/cuboids/*.pkl.gz"):
+        columns = read_frame(path)
+        write_frame(path, {**columns, "label": np.full(len(columns["label"]), LONG, object)})
+
+
 RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     # format and what is wrong: (how the log is damaged, words of the error, the place it names)
     ("kitti", "times in milliseconds"): (times(1000), "another unit", "drive|kitti"),
@@ -233,6 +286,20 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
         dgp("scene_abc.json", lambda r: [d["id"].update(timestamp="1970-01-18T20:00:00.123456Z") for d in r["data"]]),
         "another unit", "scene_abc.json"),
     ("dgp", "missing image"): (lambda r: (r / "rgb/FRONT/1.png").unlink(), "missing", "1.png"),
+    ("kitti", "class of 201 letters"): (text("derived/label_02.txt", "Car", LONG), "name is too long", "label_02.txt"),
+    ("kitti360", "number of an object of 300 digits"): (
+        text("data_3d_bboxes/train/*.xml", "<instanceId>1<", f"<instanceId>{'1' * 300}<"), "name is too long", "id of an object"),
+    ("nuscenes", "class of 201 letters"): (
+        nuscenes("category", lambda rows: rows[0].update(name=LONG)), "name is too long", "sample_annotation.json"),
+    ("argoverse2", "class of 201 letters"): (
+        lambda r: write_av2.edit(r / "annotations.feather", lambda c: c.update(category=np.full(len(c["category"]), LONG, object))),
+        "name is too long", "annotations.feather"),
+    ("argoverse2", "id of 201 letters"): (
+        lambda r: write_av2.edit(r / "annotations.feather", lambda c: c.update(track_uuid=np.full(len(c["category"]), LONG, object))),
+        "name is too long", "annotations.feather"),
+    ("pandaset", "class of 201 letters"): (long_labels, "name is too long", "cuboids"),
+    ("dgp", "class of 201 letters"): (text("ontology/*.json", '"Car"', f'"{LONG}"'), "name is too long", "bounding_box_3d"),
+    ("custom", "class of 201 letters"): (text("log.json", '"class": "car"', f'"class": "{LONG}"'), "name is too long", "tracks"),
     ("nuscenes", "missing image"): (lambda r: bad_logs.second(r / "samples/CAM_FRONT").unlink(), "missing", "CAM_FRONT"),
 }  # fmt: skip
 

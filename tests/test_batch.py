@@ -13,7 +13,7 @@ from toy_scene import ToyStreet
 from mudg import app
 from mudg.base.errors import InputError, UsageError
 from mudg.fleet import plan as lists
-from mudg.fleet.listed import ListedRun, run_listed
+from mudg.fleet.listed import run_listed
 from mudg.fleet.plan import BatchPlan, BatchStage
 from mudg.scene.read import read_scene
 
@@ -81,7 +81,7 @@ def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.Captur
     words = (sys.executable, str(tmp_path / "step.py"), "{source}", "{out}")
     plan = BatchPlan((BatchStage("command", words, direct=True),))
     entries = [lists.Entry(name, f"/logs/{name}") for name in names]
-    result = run_listed(ListedRun(("ingest",), None, entries, tmp_path / "out", jobs=2, shard_text="0/1"), plan)
+    result = run_listed(("ingest",), None, entries, tmp_path / "out", jobs=2, shard_text="0/1", plan=plan)
     assert result["exit_code"] == 13
     states = {record["name"]: (record["state"], record["words"]) for record in result["scenes"]}
     assert list(states) == ["bad", "killed", "bug", "good"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import pickle
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
 import yaml
+from pydantic import ValidationError
 
 from mudg.base import config
 from mudg.base.errors import InputError, UsageError
@@ -111,3 +114,30 @@ def test_differences_tell_values_from_settings_of_another_version():
     assert "far_m, kind, tall and 1 more" in first and second == "steps: 3 there, 4 asked"
     assert config.differences({"a": {"b": 1}}, {"a": {"b": 2}}) == ["a.b: 1 there, 2 asked"]
     assert config.differences(old, old) == []
+
+
+@config.settings
+class Garage:
+    FIXED: ClassVar = {"wheels": ("kind",)}
+    wheels: Wheels = config.setting(default_factory=Wheels)
+
+
+def test_fields_of_a_group_that_are_no_settings_keep_their_defaults(tmp_path):
+    assert config.to_dict(Garage()) == {"wheels": {"kind": "steel", "count": 4}}, "a result's key has them"
+    assert config.load(Garage, overrides={"wheels": {"kind": "steel", "count": 3}}) == Garage(wheels=Wheels(count=3))
+    with pytest.raises(UsageError, match=r"the setting wheels\.kind was removed(.|\n)*expected: nothing, or 'steel'"):
+        config.load(Garage, overrides={"wheels": {"kind": "wood"}})
+    with pytest.raises(UsageError, match="one of count\n"):
+        config.load(Garage, overrides={"wheels": {"colour": "red"}})
+    assert config.build(Wheels, {"kind": "wood"}, "record").kind == "wood", "by themselves they are as before"
+
+
+def test_values_are_checked_where_a_configuration_is_made_of_them():
+    for wrong in ({"count": "many"}, {"colour": "red"}):
+        with pytest.raises(ValidationError, match="1 validation error for Wheels"):
+            Wheels(**wrong)
+    assert dataclasses.replace(Wheels(count=2), kind="wood") == Wheels(kind="wood", count=2)
+    with pytest.raises(ValidationError):
+        dataclasses.replace(Wheels(), count=None)
+    assert config.changed(Cart(), {"seats": 5}) == Cart(seats=5) != Cart()
+    assert pickle.loads(pickle.dumps(Cart(seats=3))) == Cart(seats=3)

@@ -334,13 +334,6 @@ def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
     assert not (tmp_path / "fit").exists()
 
 
-def test_another_configuration_in_the_same_folder_is_refused(world, tmp_path):
-    Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=2)).run()
-    assert Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=2)).run() == tmp_path / "fit"
-    with pytest.raises(UsageError, match="another configuration"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=3)).run()
-
-
 def test_unknown_camera_and_no_fit(world, tmp_path):
     with pytest.raises(UsageError, match="no camera named 'rear'"):
         Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(cameras=("rear",))).run()

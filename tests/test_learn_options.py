@@ -177,9 +177,9 @@ def test_a_step_has_clips_of_one_size() -> None:
 def test_the_condition_of_freevs_is_made_of_cities_without_renders():
     from mudg.diffusion.training import clips as learn_clips
 
-    config = learn._checked_condition(LearnConfig(data=LearnData(condition="freevs")))
+    config = learn.check(LearnConfig(data=LearnData(condition="freevs")))
     rules = learn_clips.clip_rules(config)
     assert rules.near_points and not rules.fitted
     assert not learn_clips.clip_rules(LearnConfig()).near_points
     with pytest.raises(UsageError, match="generated cities only"):
-        learn._checked_condition(LearnConfig(data=LearnData(condition="freevs", scenes=("a",))))
+        learn.check(LearnConfig(data=LearnData(condition="freevs", scenes=("a",))))

@@ -637,6 +637,45 @@ def test_recordings_that_contradict_themselves_are_refused(case: str, recording:
 
 
 @needs_package
+def test_frames_in_a_gap_of_a_curve_are_refused_or_left_out(recording: Path, tmp_path: Path) -> None:
+    """12 m/s on a circle of 3 m, without the keys from 1.15 to 1.45 s: a straight line is half a metre off in the middle."""
+    keys = [at for at in range(1_000_000, 1_500_001, 25_000) if not 1_150_000 < at < 1_450_000]
+
+    def on_circle(metadata: dict[str, Any]) -> None:
+        path = metadata[RIG_POSES]["('rig', 'world')"]
+        angles = [12 * (at - 1_000_000) / 1e6 / 3 for at in keys]
+        path["timestamps_us"] = keys
+        path["poses"] = [geometry.yaw_matrix(a, (3 * np.sin(a), 3 * (1 - np.cos(a)), 0.0)).tolist() for a in angles]
+
+    (tmp_path / "log").mkdir()
+    log = altered(recording, tmp_path / "log", lambda m: (on_circle(m), m[BOXES]["cuboid_track_observations"].clear()))
+    error = roundtrip.assert_refused(ingest, log, tmp_path / "refused", "vehicle poses have a gap")
+    assert "no pose for 0.30 s" in error.got and "--skip-missing" in error.remedy and "bridge" not in error.remedy
+    whole, left = ingest(recording, tmp_path / "whole"), ingest(log, tmp_path / "left", skip_missing=True)
+    times = {round(frame.view.time_s, 3) for frame in whole.frames}
+    assert times - {round(frame.view.time_s, 3) for frame in left.frames} == {t for t in times if 0.15 < t < 0.4}
+    assert {round(sweep.time_s, 3) for sweep in left.sweeps} < {round(sweep.time_s, 3) for sweep in whole.sweeps}
+
+
+@needs_package
+def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_path: Path) -> None:
+    import zarr  # type: ignore[import-not-found]
+
+    whole = ingest(recording, tmp_path / "whole")
+    store = as_folder(recording, tmp_path)
+    name = "lidars/lidar/frames/" + sorted(path.parts[-3] for path in store.rglob("ray_bundle_returns/distance_m"))[0]
+    distance = zarr.open(zarr.DirectoryStore(str(store)), "r+")[f"{name}/ray_bundle_returns/distance_m"]
+    values = distance[:]
+    values[:, :100] = 0.0
+    distance[:] = values
+    scene = ingest(tmp_path, tmp_path / "out")
+    assert sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps) == sum(
+        len(read_points(whole, sweep).xyz) for sweep in whole.sweeps
+    ) - 100
+    assert any("100 " in note and "return" in note for note in scene.source.notes), scene.source.notes
+
+
+@needs_package
 def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Path) -> None:
     """Cut at some lengths and flipped in metadata and data: an error in words, or (pixels and points have no checksum) a scene."""
     (store,) = recording.glob("*.itar")

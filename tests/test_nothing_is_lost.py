@@ -21,7 +21,6 @@ from toy_clips import tiny, write_clips
 from toy_published import TINY, tiny_checkpoint
 from toy_scene import ToyStreet
 
-from mudg import app
 from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import chain, page
@@ -35,7 +34,7 @@ from mudg.diffusion.published import convert
 from mudg.diffusion.settings.convert import ConvertConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing.view_settings import RenderConfig, ScoreConfig
-from mudg.fleet.listed import ListedRun, run_listed
+from mudg.fleet.listed import run_listed
 from mudg.fleet.plan import Entry
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
@@ -215,15 +214,6 @@ def test_an_output_that_touches_an_input_is_refused(name: str, world: dict[str, 
     assert tree(tmp_path) == before
 
 
-def test_the_command_line_ends_with_code_2(world: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = copied(world, ("scene",), tmp_path)["scene"]
-    before = tree(tmp_path)
-    assert app.main(["fuse", str(scene), "--out", str(scene), "--overwrite"]) == 2
-    said = capsys.readouterr().err
-    assert "is also an input" in said and "what to do" in said and "Traceback" not in said
-    assert tree(tmp_path) == before
-
-
 def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, Path], tmp_path: Path) -> None:
     given = copied(world, ("scene", "plain scene"), tmp_path / "in")
     scenes = tmp_path / "scenes"
@@ -245,7 +235,7 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
     entries = [Entry("c", str(scenes / "a"))]
     for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
         with pytest.raises(UsageError, match=words):
-            run_listed(ListedRun(("fuse", "{source}"), FuseConfig(), entries, tmp_path, jobs=1, listed=list_file))
+            run_listed(("fuse", "{source}"), FuseConfig(), entries, tmp_path, jobs=1, listed=list_file)
     assert (tmp_path / "status.json").read_text() == "scenes/a\n"
 
 

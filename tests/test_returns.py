@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from collections.abc import Callable
 from dataclasses import replace
@@ -101,6 +102,7 @@ CASES: dict[str, tuple[str, Callable[[Path], None]]] = {
     "kitti zeros": ("kitti", float_rows(4, 0.0)),
     "kitti NaN": ("kitti", float_rows(4, np.nan)),
     "kitti360 zeros": ("kitti360", float_rows(4, 0.0)),
+    "kitti360 NaN": ("kitti360", float_rows(4, np.nan)),
     "nuscenes zeros": ("nuscenes", float_rows(5, 0.0)),
     "nuscenes NaN": ("nuscenes", float_rows(5, np.nan)),
     "dgp zeros": ("dgp", npz("data", 0.0)),
@@ -149,6 +151,28 @@ def test_marks_are_left_out_and_counted(
     notes = [note for note in scene.source.notes if "without a return" in note]
     assert sum(int(note.split(": ")[1].split(" of ")[0]) for note in notes) >= MARKS
     assert not any("within 0.05 m" in finding.message for finding in check_scene(scene.root))
+
+
+@pytest.mark.parametrize("form", ["waymo v1", "waymo v2"])
+def test_pixels_of_a_range_image_without_a_return_are_no_points(
+    form: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """The data set marks them by -1; 0 and NaN are no ranges either."""
+    if form in bad_logs.NEEDS_PYARROW:
+        pytest.importorskip("pyarrow")
+    log = bad_logs.written(form, bad_logs.shared(tmp_path_factory))
+    assert isinstance(log, bad_logs.write_waymo.Log)
+    spoilt = copy.deepcopy(log)
+    image = spoilt.frames[0]["lasers"][0]["returns"][0]
+    rows, columns = (part[: 3 * MARKS] for part in np.nonzero(image[..., 0] > 0))
+    image[rows, columns, 0] = np.tile([0.0, -1.0, np.nan], MARKS)
+
+    def points(one: bad_logs.write_waymo.Log, name: str) -> int:
+        source = bad_logs.write_waymo_log(one, form, tmp_path / f"{name} log")
+        scene = bad_logs.ingest(form, source, tmp_path / name, bad_logs.options_of(one))
+        return sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)
+
+    assert points(spoilt, "spoilt") == points(log, "whole") - 3 * MARKS
 
 
 @pytest.mark.parametrize("suffix", list(write_custom.CLOUDS))

@@ -175,16 +175,6 @@ def test_nothing_to_score_is_said(tmp_path: Path, scene: Path) -> None:
         Score(scene=scene, views={"a": tmp_path / "empty"}, out=tmp_path / "score2", settings=PLAIN).run()
 
 
-def test_a_finished_score_is_reused_and_another_configuration_refused(tmp_path: Path, scene: Path) -> None:
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run()
-    before = (out / "metrics.json").stat().st_mtime_ns
-    Score(scene=scene, views={"a": views}, out=out, settings=PLAIN).run()
-    assert (out / "metrics.json").stat().st_mtime_ns == before
-    with pytest.raises(UsageError, match="another configuration"):
-        Score(scene=scene, views={"a": views}, out=out, settings=ScoreConfig(width_px=24, perceptual_views=0)).run()
-
-
 def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0, -3.0), brighter(9))
     first = Score(scene=scene, views={"a": views}, out=tmp_path / "one", settings=ScoreConfig()).run()

@@ -168,13 +168,6 @@ def test_full_size_views_have_the_cameras_size(large):
     assert first.view.camera.width == 96
 
 
-def test_finished_result_is_reused(world, usual, monkeypatch):
-    monkeypatch.setattr(synthesize, "make_trajectory", None)
-    made(world, usual)
-    with pytest.raises(UsageError, match="another configuration"):
-        made(world, usual, steps=3)
-
-
 @pytest.mark.parametrize("frames", [1, 3, 8, 9, 13, 24, 199])
 @pytest.mark.parametrize("overlap", [0, 2, 7])
 def test_windows_cover_every_frame(frames, overlap):

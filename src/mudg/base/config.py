@@ -53,8 +53,8 @@ def settings(cls: type[Config]) -> type[Config]:
     pydantic is imported at the first check: help, which shows defaults and presets, does without. A default that is itself a
     configuration is a ``default_factory``.
     """
-    made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
-    with_defaults: Callable[[Any], None] = made.__init__
+    config_type: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    with_defaults: Callable[[Any], None] = config_type.__init__
 
     @functools.wraps(with_defaults)
     def checked(self: Any, *args: Any, **values: Any) -> None:
@@ -65,8 +65,8 @@ def settings(cls: type[Config]) -> type[Config]:
 
         _adapter(type(self)).validator.validate_python(ArgsKwargs(args, values), self_instance=self)
 
-    made.__init__, made.__pydantic_config__ = checked, STRICT
-    return made
+    config_type.__init__, config_type.__pydantic_config__ = checked, STRICT
+    return config_type
 
 
 @functools.cache

@@ -42,12 +42,6 @@ class Film(Output):
     videos: bool = True
     """Off: only the pictures, of the middle view and in full size."""
 
-    def reads(self) -> dict[str, Path | str | None]:
-        return {f"{name} {n}" if n else name: folder for name, of in self.views.items() for n, folder in enumerate(of)}
-
-    def inputs(self) -> dict[str, str]:
-        return self.digests(self.reads())
-
     def key_settings(self) -> dict[str, Any]:
         settings = {"columns": list(self.views), "trajectories": [path.name for path in self.paths], "panel_width_px": PANEL_WIDTH}
         return settings if self.videos else {**settings, "videos": False}

@@ -32,14 +32,14 @@ from mudg.scene.read import read_scene
 
 @dataclass(frozen=True, eq=False)
 class PlannedEdit:
-    """A script carried out in memory, and what it was carried out on. made: the edited fit."""
+    """A script carried out in memory, and what it was carried out on. edited: the edited fit."""
 
     script: EditScript
     parts: RunParts
     scene: Scene | None
     model: SceneModel
     drive: EditedDrive
-    made: SceneModel
+    edited: SceneModel
 
     @classmethod
     def of(cls, config: EditConfig, script: EditScript, parts: RunParts) -> PlannedEdit:
@@ -68,11 +68,11 @@ class PlannedEdit:
         out, plan, device = work.path, self.drive.plan, drawing_device(config.device, "render", config.raster)
         changed: dict[str, Any] = {"changed": list(plan.changes), "removed": plan.removed, "inserted": list(plan.inserted)}
         if self.parts.whole and self.scene is not None:
-            images = EditedImages(self.model.to(device), self.made.to(device), config, plan.moves_ego or plan.background is not None)
+            images = EditedImages(self.model.to(device), self.edited.to(device), config, plan.moves_ego or plan.background is not None)
             images = repairing(images, self.drive, self.scene) if config.harmonize.on else images
             changed["lidar"] = _write_run(self.drive, self.parts, self.scene, images, out)
         else:
-            save_model(self.made, out)
+            save_model(self.edited, out)
         store.write_text(out / "edits.yaml", self.script.text())
         conditions = {verb: settings.model_dump(mode="json") for verb, settings in plan.conditions.items()}
         store.write_json(out / "edit.json", {

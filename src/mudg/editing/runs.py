@@ -36,24 +36,27 @@ class RunParts:
         return next(iter(self.fits.values()))
 
 
-def find_run(folder: Path) -> RunParts:
+def find_run(folder: Path, scene: Path | None = None, fused: Path | None = None) -> RunParts:
     """What a folder holds.
+
+    Args:
+        scene, fused: count in place of its own.
 
     Raises:
         InputError: neither a fit nor a folder of ``mudg run``, or one that is not finished.
     """
     folder = Path(folder)
     if (folder / "model.json").is_file():
-        return RunParts({"": folder}, known_input(folder, "scene"), None, False)
+        return RunParts({"": folder}, scene or known_input(folder, "scene"), fused, False)
     fits = {name: folder / "fit" / name for name in BEST_FIRST if (folder / "fit" / name / "model.json").is_file()}
-    scene, fused = scene_of_run(folder), folder / "fuse"
-    if not fits or scene is None or not (fused / "fuse.json").is_file():
-        there = {"fit": bool(fits), "scene": scene is not None, "fuse": (fused / "fuse.json").is_file()}
+    own_scene, own_fused = scene_of_run(folder), folder / "fuse"
+    there = {"fit": bool(fits), "scene": own_scene is not None, "fuse": (own_fused / "fuse.json").is_file()}
+    if not all(there.values()):
         missing = [name for name, found in there.items() if not found]
         raise InputError("this folder holds no fitted scene", where=str(folder),
             expected="a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`",
             got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder", remedy=similar_path(folder))  # fmt: skip
-    return RunParts(fits, scene, fused, True)
+    return RunParts(fits, scene or own_scene, fused or own_fused, True)
 
 
 def scene_of_run(folder: Path) -> Path | None:

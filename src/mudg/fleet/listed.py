@@ -10,7 +10,6 @@ import io
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,35 +34,16 @@ def exit_code(failed: int) -> int:
     return min(FAILED_BASE + failed, FAILED_MOST) if failed else 0
 
 
-@dataclass(frozen=True)
-class ListedRun:
-    """A verb over a list.
+def run_listed(
+    words: Sequence[str], settings: Any, entries: list[Entry], out: Path, *, jobs: int = 0, shard_text: str = "",
+    listed: Path | None = None, plan: BatchPlan | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Run a step over a list.
 
     Args:
-        words: its command line for a ``{source}``. settings: of the verb. entries: the whole list. out: ROOT; ``ROOT/status.json`` (with a
+        words: its command line for a ``{source}``. settings: of the step. entries: the whole list. out: ROOT; ``ROOT/status.json`` (with a
             shard: ``status-i-of-n.json``) tells the outcome. jobs: processes; 0 = as many as there are processors. They share the
-            processors. shard_text: ``i/n`` or empty. listed: the list, where it is a file.
-    """
-
-    words: Sequence[str]
-    settings: Any
-    entries: list[Entry]
-    out: Path
-    jobs: int = 0
-    shard_text: str = ""
-    listed: Path | None = None
-
-    @property
-    def verb(self) -> str:
-        """The verb."""
-        return self.words[0]
-
-
-def run_listed(asked: ListedRun, plan: BatchPlan | None = None) -> dict[str, Any]:
-    """Run a verb over a list.
-
-    Args:
-        plan: what to do instead of the verb, for tests.
+            processors. shard_text: ``i/n`` or empty. listed: the list, where it is a file. plan: what to do instead, for tests.
 
     Returns:
         ``scenes`` (one record each), counts, ``text``: the table for people, and ``exit_code``: 0, or 10 plus the number of
@@ -73,30 +53,30 @@ def run_listed(asked: ListedRun, plan: BatchPlan | None = None) -> dict[str, Any
         UsageError: ``jobs`` is negative; an output touches a source, or the status another file. KeyboardInterrupt: the
             running scenes were stopped.
     """
-    part = parse_shard(asked.shard_text)
-    entries = shard(asked.entries, part)
-    status = asked.out / (f"status-{part[0]}-of-{part[1]}.json" if asked.shard_text else "status.json")
-    _refuse_overlaps(entries, asked.out, status, asked.listed)
-    if asked.jobs < 0:
-        raise UsageError("number of jobs cannot be negative", where="--jobs", got=str(asked.jobs))
-    jobs = min(asked.jobs or native.default_threads(), max(len(entries), 1))
+    part = parse_shard(shard_text)
+    entries = shard(entries, part)
+    status = out / (f"status-{part[0]}-of-{part[1]}.json" if shard_text else "status.json")
+    _refuse_overlaps(entries, out, status, listed)
+    if jobs < 0:
+        raise UsageError("number of jobs cannot be negative", where="--jobs", got=str(jobs))
+    jobs = min(jobs or native.default_threads(), max(len(entries), 1))
     threads = max(1, native.default_threads() // jobs)
-    log.info(f"{asked.verb}: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
-    folder = BatchFolder(Location.of(asked.out.absolute()))
-    plan = plan or listed_plan(asked.words, configuration.to_dict(asked.settings))
-    before = {entry.name: _finished(asked.out / entry.name) for entry in entries}
+    log.info(f"{words[0]}: {len(entries)} scenes, {jobs} at a time with {threads} threads each")
+    folder = BatchFolder(Location.of(out.absolute()))
+    plan = plan or listed_plan(words, configuration.to_dict(settings))
+    before = {entry.name: _finished(out / entry.name) for entry in entries}
     told: dict[str, Ended] = {}
-    with log.task(asked.verb, len(entries)) as bar, tempfile.TemporaryDirectory() as scratch:
+    with log.task(words[0], len(entries)) as bar, tempfile.TemporaryDirectory() as scratch:
 
         def note(report: Ended) -> None:
             told[report.scene] = report
             bar.advance()
 
         LocalRun(Job(folder, plan, threads, scratch=Path(scratch)), entries, jobs, Stop()).run(note)
-    outcomes = [_outcome(entry, told[entry.name], asked.out / entry.name, before[entry.name]) for entry in entries]
+    outcomes = [_outcome(entry, told[entry.name], out / entry.name, before[entry.name]) for entry in entries]
     counts = {state: sum(one["state"] == state for one in outcomes) for state in ("done", "reused", "failed")}
-    store.write_json(status, {"schema": 1, "verb": asked.verb, "counts": counts, "scenes": outcomes})
-    return {"scenes": outcomes, **counts, "status": status, "text": table(asked.verb, outcomes), "exit_code": exit_code(counts["failed"])}
+    store.write_json(status, {"schema": 1, "verb": words[0], "counts": counts, "scenes": outcomes})
+    return {"scenes": outcomes, **counts, "status": status, "text": table(words[0], outcomes), "exit_code": exit_code(counts["failed"])}
 
 
 def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
+from mudg.steps.engine import Make
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.learn import Learn
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from mudg.diffusion.adapt import PlannedAdaptation
     from mudg.diffusion.settings.adapt import AdaptConfig
     from mudg.gaussians.settings import FitConfig
-    from mudg.steps.engine import Make
 
 
 class Adapt(Output):
@@ -63,13 +63,13 @@ class Adapt(Output):
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.diffusion.adapt import PlannedAdaptation
 
-        return partial(adapted, PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted)))
+        return partial(adapt_model, PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted)))
 
     def resulting(self, folder: Path) -> Path:
         return folder / "model"
 
 
-def adapted(plan: PlannedAdaptation, work: RunDir) -> dict[str, Any]:
+def adapt_model(plan: PlannedAdaptation, work: RunDir) -> dict[str, Any]:
     """Fits and clips of all lessons, some steps of training, and the better of both models."""
     folder = work.path / "work"
     plan.make_clips(fit_scene, folder)

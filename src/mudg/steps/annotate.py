@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.layout import SCENE_FILES
+from mudg.steps.engine import Make
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
     from mudg.labels.settings import AnnotateConfig
-    from mudg.steps.engine import Make
 
 
 class Annotate(Listed):

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
-from mudg.steps.engine import Result
+from mudg.steps.engine import Make, Result
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
-    from mudg.editing.runs import RunParts
     from mudg.exporting.settings import ImportConfig
-    from mudg.steps.engine import Make
 
 
 class AssetExport(Result):
@@ -41,28 +38,23 @@ class AssetExport(Result):
     def is_file(self) -> bool:
         return True
 
-    def run_parts(self) -> RunParts:
-        """The fits and the scene of the source."""
-        from mudg.editing.runs import find_run
-
-        parts = find_run(self.source)
-        return replace(parts, scene=self.scene or parts.scene)
-
     def checked(self) -> Self:
         refuse_other_name(self.out)
         return self
 
     def inputs(self) -> dict[str, str]:
-        parts = self.run_parts()
+        from mudg.editing.runs import find_run
+
+        parts = find_run(self.source, self.scene)
         return self.digests({"fit": parts.model, "scene": parts.scene})
 
     def key_settings(self) -> dict[str, Any]:
         return {"id": self.track_id}
 
     def prepare(self, inputs: dict[str, str]) -> Make:
-        from mudg.editing import assets
+        from mudg.editing import assets, runs
 
-        return partial(assets.write_asset_from, self.run_parts(), self.track_id)
+        return partial(assets.write_asset_from, runs.find_run(self.source, self.scene), self.track_id)
 
 
 def refuse_other_name(out: Path) -> None:

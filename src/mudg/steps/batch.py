@@ -68,10 +68,10 @@ class BatchRun(Step):
         from mudg.steps import batching
 
         settings = batching.settings_of(self.preset, self.config, self.set)
-        request = batching.BatchRequest(
-            self.list, self.out, self.settings, settings, stage_lines(), self.shard, self.wait, self.scratch, self.take_over
-        )
-        return batching.run(request, self.dry_run)
+        return batching.run(
+            self.list, self.out, self.settings, settings, stage_lines(), shard_text=self.shard, wait=self.wait, scratch=self.scratch,
+            take_over=self.take_over, dry=self.dry_run,
+        )  # fmt: skip
 
 
 def stage_lines() -> dict[str, tuple[str, ...]]:

@@ -9,7 +9,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,32 +33,17 @@ from mudg.steps.settings.run import RunConfig
 _POLL_S = 10.0
 
 
-@dataclass(frozen=True)
-class BatchRequest:
-    """What ``mudg batch run`` is asked for.
-
-    Args:
-        listed: path or address of the list. out: path or address of the results. batch: where scenes run. run: settings of the steps.
-            lines: words of every step (``plan_of``). shard: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array job.
-            scratch: folder for unfinished results. take_over: drive the batch even if another driver may be alive elsewhere.
-    """
-
-    listed: str
-    out: str
-    batch: BatchConfig
-    run: RunConfig
-    lines: Mapping[str, Sequence[str]]
-    shard: str = ""
-    wait: bool = False
-    scratch: Path | None = None
-    take_over: bool = False
-
-
-def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
+def run(
+    listed: str, out: str, batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]], *, shard_text: str = "",
+    wait: bool = False, scratch: Path | None = None, take_over: bool = False, dry: bool = False,
+) -> dict[str, Any]:  # fmt: skip
     """Run the steps of a batch, or submit the tasks that do.
 
     Args:
-        dry: only say what there is to do.
+        listed: path or address of the list. out: path or address of the results. batch: where scenes run. settings: of the steps.
+            lines: words of every step (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array
+            job. scratch: folder for unfinished results. take_over: drive the batch even if another driver may be alive elsewhere.
+            dry: only say what there is to do.
 
     Returns:
         Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
@@ -67,17 +52,17 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
         UsageError: settings that contradict each other, an output that belongs to another batch, or to another driver. InputError: a
             bad list. KeyboardInterrupt: asked to stop; running steps have written checkpoints.
     """
-    listed = read_list(asked.listed, (*OF_A_LINE, REVISION))
-    part = parse_shard(asked.shard)
-    if asked.shard and asked.batch.engine != "local":
-        raise UsageError("the engine itself shares out the list", where="--shard", got=f"--engine {asked.batch.engine}")
-    plan, folder = plan_for(asked.batch, asked.run, asked.lines), BatchFolder(Location.of(asked.out))
+    scenes = read_list(listed, (*OF_A_LINE, REVISION))
+    part = parse_shard(shard_text)
+    if shard_text and batch.engine != "local":
+        raise UsageError("the engine itself shares out the list", where="--shard", got=f"--engine {batch.engine}")
+    plan, folder = plan_for(batch, settings, lines), BatchFolder(Location.of(out))
     if folder.out.local is not None:
         folder = BatchFolder(Location.of(folder.out.local.absolute()))
-    _refuse_overlap(listed, folder, asked.listed)
+    _refuse_overlap(scenes, folder, listed)
     if not dry:
-        folder.begin(plan, listed)
-    done, failed, ours = folder.keys("done"), folder.keys("failed"), shard(listed, part)
+        folder.begin(plan, scenes)
+    done, failed, ours = folder.keys("done"), folder.keys("failed"), shard(scenes, part)
     entries = [entry for entry in ours if is_open(plan, entry, done, failed)]
     if dry:
         keys = [unit.key for entry in ours for unit in plan.units(entry)]
@@ -85,14 +70,14 @@ def run(asked: BatchRequest, dry: bool = False) -> dict[str, Any]:
         left = counts["steps"] - counts[DONE] - counts["failed"]
         text = f"{len(ours)} scenes: {' -> '.join(stage.name for stage in plan.stages)}"
         return {**counts, "left": left, "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"}
-    job = Job(folder, plan, max(1, round(asked.batch.cpus)), asked.batch.grace_s, _absolute(asked.scratch))
-    with folder.owned(part, numbered=asked.shard.startswith("env"), take_over=asked.take_over) as owner:
-        if asked.batch.engine == "slurm" and entries:
-            number, messages = engines.submit_to_slurm(job, entries, asked.batch)
+    job = Job(folder, plan, max(1, round(batch.cpus)), batch.grace_s, _absolute(scratch))
+    with folder.owned(part, numbered=shard_text.startswith("env"), take_over=take_over) as owner:
+        if batch.engine == "slurm" and entries:
+            number, messages = engines.submit_to_slurm(job, entries, batch)
             me = next(one for one in folder.owners().values() if one.process == os.getpid())
             owner.save(me.model_copy(update={"job": number}).model_dump_json().encode())
-            return _submitted(folder, plan, entries, number, messages, asked.wait)
-        counts = _run(job, entries, asked.batch)
+            return _submitted(folder, plan, entries, number, messages, wait)
+        counts = _run(job, entries, batch)
     text = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "nothing was left to do here"
     return {"counts": dict(counts), "out": str(folder.out), "text": f"{text}\nmudg batch status {folder.out}",
             "exit_code": exit_code(counts.total() - counts[DONE])}  # fmt: skip

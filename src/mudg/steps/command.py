@@ -163,8 +163,8 @@ def words_of(step: Step) -> list[str]:
             flags += _flag_words(field.name, value)
     if cls.settings_type() is not None:
         usual = {one.name: one.default for one in options(cls, cls.settings_from(own, None, {})) if not one.own}
-        given = {one.name: one.default for one in options(cls, vars(step)["settings"]) if not one.own}
-        flags += [word for name, value in given.items() if value != usual[name] for word in _flag_words(name, value)]
+        values = {one.name: one.default for one in options(cls, vars(step)["settings"]) if not one.own}
+        flags += [word for name, value in values.items() if value != usual[name] for word in _flag_words(name, value)]
     return [*words, *flags]
 
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from mudg.base.layout import MODEL_FILES, SCENE_FILES, below
+from mudg.steps.engine import Make
 from mudg.steps.outputs import Output
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
     from mudg.editing.runs import RunParts
     from mudg.editing.settings import EditConfig
-    from mudg.steps.engine import Make
 
 _MODELS = (*MODEL_FILES, *below("fit/*", MODEL_FILES))
 _CLOUDS = ("static.safetensors", "objects/*.safetensors", "fuse.json")
@@ -47,8 +46,7 @@ class Edit(Output):
         """The fits, scene and clouds that are edited."""
         from mudg.editing.runs import find_run
 
-        parts = find_run(self.source)
-        return replace(parts, scene=self.scene or parts.scene, fused=self.fused or parts.fused)
+        return find_run(self.source, self.scene, self.fused)
 
     def reads(self) -> dict[str, Path | str | None]:
         parts = self.run_parts()

@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from mudg.steps.step import Step, flag_of, hint_of
+from mudg.steps.step import Step, flag_of, hint_of, hints
 
 if typing.TYPE_CHECKING:
     from mudg.base.run_folder import RunDir, VerbOutput
     from mudg.editing.script import EditScript
-
 
 Make = Callable[[Any], dict[str, Any]]
 
@@ -55,11 +54,11 @@ class Result(Step):
 
     def reads(self) -> dict[str, Path | str | None]:
         """Files and folders that it reads, by their names in messages. The output must lie apart from all of them."""
-        found = paths_of(self)
-        for path in [path for name, path in found.items() if is_script(self, name) and path]:
+        paths = paths_of(self)
+        for path in [path for name, path in paths.items() if is_script(self, name) and path]:
             script = script_of(Path(path))
-            found |= {f"{path}: {file}": place for file, place in script.files().items()} if script is not None else {}
-        return found
+            paths |= {f"{path}: {name}": file for name, file in script.files().items()} if script is not None else {}
+        return paths
 
     def inputs(self) -> dict[str, str]:
         """Digests of what the result depends on. They are part of the key, in this order."""
@@ -147,19 +146,15 @@ def opened(step: Result) -> tuple[Result, RunDir, Make]:
 
 
 def paths_of(step: Step) -> dict[str, Path | str | None]:
-    """Inputs of a step by name, as its fields declare them: further ones of a field are numbered, and an edit script names more."""
-    found: dict[str, Path | str | None] = {}
+    """Inputs of a step by name, as its fields declare them; further ones of a name are numbered."""
+    paths: dict[str, Path | str | None] = {}
     for field in dataclasses.fields(step):
         value = getattr(step, field.name)
         if field.name in ("out", "list") or not is_path(hint_of(type(step), field.name)):
             continue
-        if isinstance(value, Mapping):
-            found |= value
-        elif isinstance(value, tuple):
-            found |= {f"{field.name} {number}" if number else field.name: path for number, path in enumerate(value)}
-        else:
-            found[field.name] = value
-    return found
+        for name, inner in value.items() if isinstance(value, Mapping) else [(field.name, value)]:
+            paths |= {f"{name} {n}" if n else name: path for n, path in enumerate(inner if isinstance(inner, tuple) else (inner,))}
+    return paths
 
 
 def is_path(kind: Any) -> bool:
@@ -170,7 +165,7 @@ def is_path(kind: Any) -> bool:
 
 def is_script(step: Step, name: str) -> bool:
     """Whether a field names an edit script."""
-    return name in {field.name for field in dataclasses.fields(step)} and flag_of(type(step), name).metavar.endswith(".yaml")
+    return name in hints(type(step)) and flag_of(type(step), name).metavar.endswith(".yaml")
 
 
 def script_of(path: Path | None) -> EditScript | None:

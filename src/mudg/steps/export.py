@@ -6,14 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from mudg.steps.engine import Result, script_of
+from mudg.steps.engine import Make, Result, script_of
 from mudg.steps.step import FILE_YAML, RUN, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
     from mudg.editing.runs import RunParts
     from mudg.exporting.settings import ExportConfig
-    from mudg.steps.engine import Make
 
 
 class Export(Result):

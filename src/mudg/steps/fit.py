@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
-from mudg.steps.engine import paths_of
+from mudg.steps.engine import Make, paths_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
     from mudg.gaussians.settings import FitConfig
-    from mudg.steps.engine import Make
 
 
 class Fit(Output):
@@ -68,8 +67,8 @@ class Fit(Output):
             return self
         from mudg.gaussians import fit
 
-        given = (self.fused is not None, bool(self.observations), self.start_from is not None)
-        fit.check(self.settings, fused=given[0], virtual=given[1], continued=given[2])
+        continued = self.start_from is not None
+        fit.check(self.settings, fused=self.fused is not None, virtual=bool(self.observations), continued=continued)
         return self
 
     def reads(self) -> dict[str, Path | str | None]:

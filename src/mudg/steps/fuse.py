@@ -6,12 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
+from mudg.steps.engine import Make
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
     from mudg.scene.settings import FuseConfig
-    from mudg.steps.engine import Make
 
 
 class Fuse(Listed):

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
+from mudg.steps.engine import Make
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag, usage
 
 if TYPE_CHECKING:
     from mudg.formats.settings import IngestConfig
-    from mudg.steps.engine import Make
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
 OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from mudg.steps.engine import opened
 from mudg.steps.outputs import Output
@@ -24,7 +24,7 @@ class Learn(Output):
     )  # fmt: skip
     smaller = "smaller clips (--data.width, --data.height), a smaller batch, fewer --compute.workers"
     result = "model"
-    version = 1
+    version, idle = 1, ("compute",)
     files = ("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png", "tensorboard/", "loss.png",
              "metrics.json", "model/*", "model.part/")  # fmt: skip
     short = (
@@ -53,8 +53,3 @@ class Learn(Output):
         from mudg.diffusion import learn
 
         return learn.inputs_of(self.settings)
-
-    def key_settings(self) -> dict[str, Any]:
-        from mudg.base.config import to_dict
-
-        return {name: value for name, value in to_dict(self.settings).items() if name != "compute"}

@@ -47,13 +47,14 @@ class Listed(Output):
             raise UsageError("give a source or a list, not both", got=f"{source} and --list {self.list}")
         if self.list is None:
             return super().act()
-        from mudg.fleet.listed import ListedRun, run_listed
+        from mudg.fleet.listed import run_listed
         from mudg.fleet.plan import read_list
 
         one = type(self).build({positions(type(self))[0]: "{source}", "out": self.out, "overwrite": self.overwrite})
         entries = read_list(self.list, self.of_a_line)
-        return run_listed(ListedRun(words_of(one), self.settings_in_list(), entries, self.out, self.jobs, self.shard, self.list))
+        settings = self.settings_in_list()
+        return run_listed(words_of(one), settings, entries, self.out, jobs=self.jobs, shard_text=self.shard, listed=self.list)
 
     def settings_in_list(self) -> Any:
         """Settings of the steps over a list, several of which run at a time."""
-        return self.settings
+        return vars(self)["settings"]

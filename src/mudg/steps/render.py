@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.steps.engine import script_of
+from mudg.steps.engine import Make, script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, Flag
 
 if TYPE_CHECKING:
     from mudg.editing.view_settings import RenderConfig
-    from mudg.steps.engine import Make
 
 
 class RenderViews(Output):

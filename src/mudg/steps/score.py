@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
+from mudg.steps.engine import Make
 from mudg.steps.outputs import Output
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
     from mudg.editing.view_settings import ScoreConfig
-    from mudg.steps.engine import Make
 
 _FILES = ("lpips_weights", "lpips_vgg_weights", "lpips_squeeze_weights", "fid_weights", "fvd_weights", "dino_weights", "clip_weights",
           "video_features", "detections", "lanes")  # fmt: skip
@@ -39,7 +39,6 @@ class Score(Output):
     """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE
     without the flag."""
     settings: ScoreConfig
-
     truth: Annotated[Path | None, Flag(hidden=True)] = None
     """Folder of `DrawTruth` for the scene, read instead of drawing the truth again."""
 

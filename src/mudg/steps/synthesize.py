@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.steps.engine import script_of
+from mudg.steps.engine import Make, script_of
 from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.diffusion.settings.synthesize import SynthesizeConfig
-    from mudg.steps.engine import Make
 
 
 class Synthesize(Output):
@@ -80,7 +79,7 @@ class Synthesize(Output):
         scene, script = read_scene(self.scene), script_of(self.edits)
         if self.fitted is not None:
             model_of_scene(self.fitted, scene)  # refuses the fit of another scene
-        given = JobInputs(self.scene, cast("Path", self.fused), self.fitted)
+        job = JobInputs(self.scene, cast("Path", self.fused), self.fitted)
         if script is not None:
-            scene, given = edited_scene(script, self.settings, given, scene), replace(given, edited=partial(edited_drive, script))
-        return partial(write_views, self.settings, given, scene)
+            scene, job = edited_scene(script, self.settings, job, scene), replace(job, edited=partial(edited_drive, script))
+        return partial(write_views, self.settings, job, scene)

@@ -562,7 +562,7 @@ class Columns:
 
 
 def film(out: Path) -> list[TrajectoryVideo]:
-    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see ``stages.run``).
+    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see ``steps.pipeline``).
 
     Raises:
         InputError: the run is not scored yet, or a folder of views is damaged.

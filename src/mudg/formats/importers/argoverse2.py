@@ -37,6 +37,7 @@ from mudg.formats.importers.common import (
     finite_columns,
     require_columns,
     returns_of,
+    unit_intensity,
 )
 from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.formats.importers.layout import (
@@ -331,7 +332,7 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     returns = returns_of(columns, where, places)
     columns = {name: values[returns] for name, values in columns.items()}
     xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
-    intensity = finite_columns(columns, ("intensity",), where)[:, 0]
+    intensity = unit_intensity(finite_columns(columns, ("intensity",), where)[:, 0], 255, where)
     offset_ns = columns["offset_ns"]
     if offset_ns.dtype.kind not in "iu" or (
         len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
@@ -339,9 +340,6 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
         raise InputError("point times are no nanoseconds of one turn", where=f"{where}: offset_ns",
             expected="whole nanoseconds since the sweep's time, under half a second",
             got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")  # fmt: skip
-    if len(intensity) and (intensity.min() < 0 or intensity.max() > 255):
-        raise InputError("intensity is out of range", where=where, expected="0 to 255",
-            got=f"{intensity.min():g} to {intensity.max():g}")  # fmt: skip
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
-    return SweepPoints(xyz, (intensity / 255).astype(np.float32), dt_s, no_returns=int((~returns).sum()))
+    return SweepPoints(xyz, intensity, dt_s, no_returns=int((~returns).sum()))

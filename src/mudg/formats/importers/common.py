@@ -46,6 +46,7 @@ from mudg.scene.clouds import is_return, near_places
 
 
 Columns = Mapping[str, NDArray[Any]]
+_ROUNDING: Final = 1e-3
 
 
 def require_columns(names: Iterable[str], there: Iterable[str], where: object) -> None:
@@ -72,6 +73,19 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
         raise InputError("column holds values that are not finite", where=where,
             got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}")  # fmt: skip
     return table
+
+
+def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: str = "") -> NDArray[np.float32]:
+    """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that is taken off.
+
+    Raises:
+        InputError: other values, which would all become 0 or 1, or some that are not finite.
+    """
+    scaled = values.astype(np.float64) / largest
+    if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
+        raise InputError("intensity is out of range", where=str(where), expected=f"0 to {largest:g}",
+            got=f"{values.min():g} to {values.max():g}", remedy=remedy or "scale the values as the data set does")  # fmt: skip
+    return scaled.clip(0, 1).astype(np.float32)
 
 
 def returns_of(columns: Columns, where: object, places: Iterable[NDArray[np.float64]] = ()) -> NDArray[np.bool_]:

@@ -29,6 +29,7 @@ from mudg.formats.importers.common import (
     mended_path,
     nearest_index,
     pose_near,
+    unit_intensity,
 )
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import Lens, brown_conrady, equidistant, fit_images, image_notes
@@ -592,12 +593,8 @@ def _intensity(cloud: Cloud, lidar: LogLidar, name: str, path: Path) -> NDArray[
         return np.zeros(len(cloud.xyz), np.float32)
     remedy = f"name the field in log.json: lidars.{name}.intensity_field; an empty text if there is none"
     values = _field(cloud, lidar.intensity_field, "intensity", path, remedy)
-    scaled = np.nan_to_num(values.astype(np.float64) / lidar.intensity_max, nan=0.0)
-    if scaled.min() < 0 or scaled.max() > 1 + 1e-6:
-        expected, got = f"0 to {lidar.intensity_max:g}", f"{values[np.abs(scaled - 0.5).argmax()]:g}"
-        remedy = f"give the largest possible value in log.json: lidars.{name}.intensity_max (often 255)"
-        raise InputError("intensity is out of range", where=str(path), expected=expected, got=got, remedy=remedy)
-    return scaled.clip(0, 1).astype(np.float32)
+    remedy = f"give the largest possible value in log.json: lidars.{name}.intensity_max (often 255)"
+    return unit_intensity(np.nan_to_num(values.astype(np.float64)), lidar.intensity_max, path, remedy)
 
 
 def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDArray[np.float32]:

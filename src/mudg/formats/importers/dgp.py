@@ -356,4 +356,6 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
             got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")  # fmt: skip
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
+    if len(intensity) and not (-1e-3 < float(intensity.min()) <= float(intensity.max()) < 1.001):  # the format states no range
+        log.info_once("dgp: intensities outside of 0 to 1 are taken as 0 and 1: divide them by their largest value")
     return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32), no_returns=no_returns)

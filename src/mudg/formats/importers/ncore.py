@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,7 @@ from mudg.formats.ncore import (
     rotation_of,
 )
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
+from mudg.scene import motion
 
 # container ------------------------------------------------------------------------------------------------------------
 #
@@ -289,6 +290,7 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
 # importer -------------------------------------------------------------------------------------------------------------
 
 
+Record = TypeVar("Record", ImageRecord, SweepRecord)
 _LIST: Final[Known] = {
     **dict.fromkeys(("sequence_id", "sequence_timestamp_interval_us", "generic_meta_data", "version")),
     "component_stores": dict.fromkeys(("path", "md5", "components")),
@@ -515,6 +517,7 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     lidars = _scene_names(turns, set(names.values()))
     sweeps = [one for lidar, found in turns.items() for one in _sweeps(recording, lidar, lidars[lidar], found, zero_us)]
     ego = _ego(recording, zero_us, np.concatenate([found.reshape(-1) for found in (*spans.values(), *turns.values())]))
+    images, sweeps = _outside_gaps(images, ego, options), _outside_gaps(sweeps, ego, options)
     tracks, track_notes = _tracks(recording, zero_us)
     about = _about(recording)
     source = Source(
@@ -735,6 +738,21 @@ def _ego(recording: _OpenRecording, zero_us: int, moments: Times) -> EgoPath:
     times = np.concatenate([found[1].astype(np.int64) for found in keys.values()]) if keys else np.unique(moments)
     poses = recording.world_from(RIG, times, where)
     return ego_path([(int(at) - zero_us) / MICRO for at in times], list(poses))
+
+
+def _outside_gaps(records: list[Record], ego: EgoPath, options: ImportOptions) -> list[Record]:
+    """The records whose poses are none that the package guessed on a straight line through a gap of the path's keys."""
+    there = []
+    for record in records:
+        gap = motion.gap_at(ego, record.time_s)
+        if gap is None:
+            there.append(record)
+        elif not options.skip_missing:
+            raise InputError("vehicle poses have a gap here", where=record.place, got=f"at {record.time_s:.3f} s: {gap}",
+                expected="poses around every image and scan", remedy="leave such frames out with --skip-missing")  # fmt: skip
+    if len(there) < len(records):
+        log.warn(f"ncore: left out {len(records) - len(there)} records in gaps of the vehicle's poses")
+    return there
 
 
 def _tracks(recording: _OpenRecording, zero_us: int) -> tuple[list[Track], list[str]]:

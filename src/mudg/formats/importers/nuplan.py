@@ -47,6 +47,7 @@ from mudg.formats.importers.common import (
     pose_near,
     require_columns,
     seconds,
+    unit_intensity,
     world_from_first,
 )
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
@@ -691,6 +692,6 @@ def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:
     cloud = read_cloud(path)
     intensity = cloud.fields.get("intensity", np.zeros(len(cloud.xyz)))
     returns = ~near_places(cloud.xyz, places)
-    xyz, grey = cloud.xyz[returns].astype(np.float32), np.clip(intensity[returns].astype(np.float64) / 255, 0, 1)
+    xyz, grey = cloud.xyz[returns].astype(np.float32), unit_intensity(intensity[returns], 255, f"{path}: intensity")
     no_returns = cloud.missing + int((~returns).sum())
-    return SweepPoints(xyz, grey.astype(np.float32), np.zeros(len(xyz), np.float32), no_returns=no_returns)
+    return SweepPoints(xyz, grey, np.zeros(len(xyz), np.float32), no_returns=no_returns)

@@ -39,7 +39,7 @@ from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log, layout
 from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.clouds import read_float_rows
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.common import ImportOptions, unit_intensity
 from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
 from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import note_unknown
@@ -93,7 +93,7 @@ def read_scan(path: Path) -> SweepPoints:
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
         own &= (rows[:, axis] > low) & (rows[:, axis] < high)
     chosen = returns & ~own
-    xyz, intensity = np.ascontiguousarray(rows[chosen, :3]), (rows[chosen, 3] / 255).clip(0, 1).astype(np.float32)
+    xyz, intensity = np.ascontiguousarray(rows[chosen, :3]), unit_intensity(rows[chosen, 3], 255, path)
     return SweepPoints(xyz, intensity, dt_s[chosen], no_returns=int((~returns).sum()))
 
 

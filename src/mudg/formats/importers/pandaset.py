@@ -54,6 +54,7 @@ from mudg.formats.importers.common import (
     require_columns,
     returns_of,
     seconds,
+    unit_intensity,
     world_from_first,
 )
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
@@ -637,7 +638,7 @@ class _Cloud:
 
     time_s: float
     xyz: Matrix
-    intensity: NDArray[np.float64]
+    intensity: NDArray[np.float32]
     dt_s: NDArray[np.float64]
     d: NDArray[np.float64]
     returns: NDArray[np.bool_]
@@ -669,7 +670,7 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     turning = late_s[columns["d"] == 0]
     middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
     xyz = np.stack([columns[axis] for axis in "xyz"], 1)
-    intensity = (columns["i"] / 255).clip(0, 1)
+    intensity = unit_intensity(columns["i"], 255, f"{path}: i")
     return _Cloud(frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
 
 

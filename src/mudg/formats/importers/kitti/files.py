@@ -19,7 +19,7 @@ from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix, ya
 from mudg.base.types import Camera, SweepPoints, Track
 from mudg.formats.importers.box_tracks import BoxTracks, box_size
 from mudg.formats.importers.clouds import read_float_rows
-from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation
+from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation, unit_intensity
 from mudg.formats.unknown_fields import note_unknown
 
 # scans ----------------------------------------------------------------------------------------------------------------
@@ -39,13 +39,14 @@ def read_scan(path: Path) -> SweepPoints:
     """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
 
     Raises:
-        InputError: cut off, or values that are not finite.
+        InputError: cut off, values that are not finite, or a reflectance outside of 0..1.
     """
     rows, returns = read_float_rows(path, 4)
     rows = rows[returns]
     dt_s = np.zeros(len(rows), np.float32)
     no_returns = int((~returns).sum())
-    return SweepPoints(np.ascontiguousarray(rows[:, :3]), np.clip(rows[:, 3], 0, 1), dt_s, no_returns=no_returns)
+    intensity = unit_intensity(rows[:, 3], 1, path, "divide the reflectance by its largest value, often 255")
+    return SweepPoints(np.ascontiguousarray(rows[:, :3]), intensity, dt_s, no_returns=no_returns)
 
 
 def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
