@@ -254,20 +254,22 @@ def commands(log):
     with subprocess.Popen(
         [sys.executable, "-c", COMMANDS], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
     ) as server:
+        orders, answers = server.stdin, server.stdout
+        assert orders is not None and answers is not None
 
         def command(out, processes=1, sent=None, after_s=0.0):
-            print(json.dumps([*map(str, words), str(out), "--processes", str(processes)]), file=server.stdin, flush=True)
-            child = int(server.stdout.readline())
+            print(json.dumps([*map(str, words), str(out), "--processes", str(processes)]), file=orders, flush=True)
+            child = int(answers.readline())
             if sent is not None:
                 while not out.exists():
                     time.sleep(0.01)
                 time.sleep(after_s)
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(child, sent)
-            return int(next(line for line in server.stdout if line.strip().lstrip("-").isdigit()))  # behind what the command prints
+            return int(next(line for line in answers if line.strip().lstrip("-").isdigit()))  # behind what the command prints
 
         yield command
-        server.stdin.close()
+        orders.close()
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from mudg.steps.annotate import Annotate
-from mudg.steps.command import words_of
 from mudg.steps.fit import Fit
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
@@ -76,6 +75,8 @@ class BatchRun(Step):
 
 def stage_lines() -> dict[str, tuple[str, ...]]:
     """Command lines of the steps that a batch can do for each of its scenes, with names of other steps for their results."""
+    from mudg.steps.command import words_of
+
     scene = {"scene": "{scene}", "fused": "{fuse}"}
     steps = (
         Run.build({"source": "{source}", "out": "{out}"}), Ingest.build({"log": "{source}", "out": "{out}"}),

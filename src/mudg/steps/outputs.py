@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from mudg.base.errors import UsageError
-from mudg.steps.command import words_of
 from mudg.steps.engine import Result
 from mudg.steps.step import Flag, positions
 
@@ -49,6 +48,7 @@ class Listed(Output):
             return super().act()
         from mudg.fleet.listed import run_listed
         from mudg.fleet.plan import read_list
+        from mudg.steps.command import words_of
 
         one = type(self).build({positions(type(self))[0]: "{source}", "out": self.out, "overwrite": self.overwrite})
         entries = read_list(self.list, self.of_a_line)
