@@ -11,7 +11,6 @@ from toy_world import camera, fused_cloud, view_at
 
 from mudg.base.errors import UsageError
 from mudg.base.types import FusedCloud, Photo, RenderPlanes
-from mudg.benchmarks import chain
 from mudg.benchmarks.chain import Chain, repair_settings
 from mudg.benchmarks.rows import Row
 from mudg.benchmarks.settings import BenchConfig
@@ -23,6 +22,8 @@ from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.gaussians.methods import METHODS
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import FitConfig
+from mudg.steps.fit import Fit
+from mudg.steps.synthesize import Synthesize
 
 
 def shown(view):
@@ -78,20 +79,20 @@ def test_repaired_views_move_towards_their_places():
 def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with_the_first(tmp_path, monkeypatch):
     done: list[tuple] = []
 
-    def repaired(config, scene, fused, out, *, fitted, overwrite=False):
-        done.append(("repair", config.shifts_m, "/".join(fitted.parts[-2:])))
-        for shift in config.shifts_m:
-            (out / f"front_shift{shift:+.1f}").mkdir(parents=True)
-            (out / f"front_shift{shift:+.1f}" / "observations.json").write_text("{}")
-        return out
+    def repaired(step):
+        done.append(("repair", step.settings.shifts_m, "/".join(step.fitted.parts[-2:])))
+        for shift in step.settings.shifts_m:
+            (step.out / f"front_shift{shift:+.1f}").mkdir(parents=True)
+            (step.out / f"front_shift{shift:+.1f}" / "observations.json").write_text("{}")
+        return step.out
 
-    def fitted(config, scene, fused, out, *, observations, start, overwrite=False):
-        begun = None if start is None else "/".join(start.parts[-2:])
-        done.append((config.method, config.iterations, ["/".join(path.parts[-2:]) for path in observations], begun))
-        return out
+    def fitted(step):
+        begun = None if step.start_from is None else "/".join(step.start_from.parts[-2:])
+        done.append((step.settings.method, step.settings.iterations, ["/".join(path.parts[-2:]) for path in step.observations], begun))
+        return step.out
 
-    monkeypatch.setattr(chain.synthesize, "run", repaired)
-    monkeypatch.setattr(chain.fit, "run", fitted)
+    monkeypatch.setattr(Synthesize, "run", repaired)
+    monkeypatch.setattr(Fit, "run", fitted)
     steps = Chain(tmp_path, tmp_path / "scene", BenchConfig(iterations=100), False, SynthesizeConfig(shifts_m=(3.0,)))
     row = Row("difix", "", "difix", FitConfig(method="difix", iterations=100))
     assert steps.fitted(row) == tmp_path / "fit" / "difix"

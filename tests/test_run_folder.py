@@ -411,18 +411,18 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "other").mkdir()
     (tmp_path / "link").symlink_to("data/scene")
     (tmp_path / "other" / "up").symlink_to("../data")
-    (tmp_path / "weights_link").symlink_to("scene/weights")
+    (tmp_path / "weights_link").symlink_to("data/scene/weights")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 OVERLAPS = [
-    ("data/scene", "data/scene", "is also"), ("scene/", "link", "is also"), ("link", "data/scene", "is also"),
+    ("data/scene", "data/scene", "is also"), ("data/scene/", "link", "is also"), ("link", "data/scene", "is also"),
     ("data/../data/scene", "data/scene", "is also"), ("other/up/scene", "data/scene", "is also"),
-    ("data", "data/scene", "holds"), (".", "link", "holds"), ("scene/new", "data/scene", "lies in"),
+    ("data", "data/scene", "holds"), (".", "link", "holds"), ("data/scene/new", "data/scene", "lies in"),
     ("link/a/b/c", "data/scene", "lies in"), ("other/../link/new", "data/scene", "lies in"),
-    ("other/up/scene/new", "link", "lies in"), ("data/scene", "scene/weights", "holds"),
-    ("scene/weights", "scene/weights", "is also"), ("data/scene", "weights_link", "holds"),
+    ("other/up/scene/new", "link", "lies in"), ("data/scene", "data/scene/weights", "holds"),
+    ("data/scene/weights", "data/scene/weights", "is also"), ("data/scene", "weights_link", "holds"),
     ("link/images", "data", "lies in"),
 ]  # fmt: skip
 
@@ -439,7 +439,7 @@ def test_overlaps_are_found_through_links_and_dots(places: Path, out: str, given
 
 @pytest.mark.parametrize(
     ("out", "given"),
-    [("other", "data/scene"), ("data/scene2", "data/scene"), ("data/new/deep", "link"), ("scene/images", "scene/weights"),
+    [("other", "data/scene"), ("data/scene2", "data/scene"), ("data/new/deep", "link"), ("data/scene/images", "data/scene/weights"),
      ("data/sc", "data/scene"), ("nowhere", "nothing there")],
 )  # fmt: skip
 def test_neighbours_do_not_overlap(places: Path, out: str, given: str) -> None:

@@ -47,7 +47,7 @@ def test_processor_time_of_children_that_have_ended_counts() -> None:
 GIVEN_BACK = """
 import time
 import numpy as np
-from mudg.base import usage
+from mudg.base import memory as usage
 meter, before = usage.Meter(), usage.held_bytes()
 held = np.ones(80 << 17)  # 80 MiB
 time.sleep(3 * usage.PERIOD_S)
@@ -108,7 +108,7 @@ def test_what_child_processes_share_counts_once(tmp_path: Path) -> None:
 FORKING = """
 import os, time
 import numpy as np
-from mudg.base import usage
+from mudg.base import memory as usage
 held = np.ones(25 << 20)
 alone = usage.held_bytes()
 theirs, ours = os.pipe()
@@ -157,7 +157,8 @@ def test_shares_are_asked_for_only_where_a_new_peak_is_possible(monkeypatch: pyt
 
 FREEING = """
 import numpy as np
-from mudg.base import memory, usage
+from mudg.base import memory
+from mudg.base import memory as usage
 blocks = [np.ones(12_000) for _ in range(1000)]  # 96 kB each: too small for a mapping of their own
 last = np.ones(12_000)
 full = usage.held_bytes()

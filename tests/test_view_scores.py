@@ -233,7 +233,7 @@ def city_run(city: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     path = trajectory.shifted(scene, "front", 2.0)
     for name, masks in (("right", True), ("gray", False), ("truth", True)):
         for number, view in enumerate(path.views):
-            lanes = detections.lane_scores.lane_truth(view, world.lane_lines())
+            lanes = detections.street_scores.lane_truth(view, world.lane_lines())
             target = folder / "lanes" / name / path.name / f"{number:06d}.png"
             store.write_image(target, (lanes & masks).astype(np.uint8) * 255)
     truth = DrawTruth(scene=city, trajectories=(path,), out=folder / "drawn").run()
