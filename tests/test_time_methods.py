@@ -535,6 +535,8 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
             ).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
         Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, densify__kind="mcmc")).run()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "model.json").write_text("{}")
     with pytest.raises(UsageError, match="cannot go on"):
         Fit(
             scene=world["scene"], fused=world["fuse"], start_from=tmp_path / "other", out=tmp_path / "fit", settings=settings(method)
