@@ -19,8 +19,9 @@ from mudg.base import geometry
 from mudg.base.types import View
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
-from mudg.core.depth import beyond_reach, complete_depth, visible_depth
+from mudg.core.depth import beyond_reach, complete_depth
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
+from mudg.core.project import RULES, visible_depth
 
 FAR_M = 100.0
 
@@ -74,7 +75,7 @@ def main() -> None:
         recorded = world.render(view, sensor_noise=True)
         xyz = points_at(world, view, 12, options.sweeps)
         started = time.process_time()
-        measured = visible_depth(view, xyz)
+        measured = visible_depth(view, xyz, RULES["sweep"])
         beyond = beyond_reach(view, measured, np.deg2rad(config.lidar_upper_deg))
         dense = complete_depth(recorded.rgb_u8, measured, recorded.sky, beyond)
         worked = time.process_time() - started

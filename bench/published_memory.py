@@ -2,7 +2,7 @@
 
     python bench/published_memory.py
 
-Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/stages/learning/memory_plan.py` for what is counted.
+Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/training/memory_plan.py` for what is counted.
 """
 
 import sys
