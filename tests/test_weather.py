@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mudg.base import geometry
-from mudg.base.config import build, to_dict
+from mudg.base.config import build
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, View
@@ -413,7 +413,7 @@ def test_snow_that_has_fallen_leaves_a_sky_without_end_as_it_is() -> None:
 
 def test_settings_go_through_plain_values_and_refuse_what_is_out_of_range() -> None:
     for case in CASES.values():
-        assert build(Conditions, to_dict(case), "edits") == case
+        assert build(Conditions, case.model_dump(mode="json"), "edits") == case
     with pytest.raises(UsageError, match="visibility_m"):
         build(Conditions, {"weather": {"fog": {"visibility_m": 0.1}}}, "edits.yaml")
 
