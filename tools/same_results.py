@@ -98,7 +98,7 @@ for name, text in {
     "wrong_key": "- remove: {idss: [car-001]}", "wrong_id": "- remove: {ids: [car-999]}",
 }.items():
     (edits / f"{name}.yaml").write_text(text + "\\n")
-(root / "list.txt").write_text("in/logs/custom name=a\\nin/logs/dgp name=b\\n")
+(root / "list.txt").write_text("logs/custom name=a\\nlogs/dgp name=b\\n")
 """
 
 
