@@ -153,6 +153,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        auto_reload=False,  # what is loaded needs no file any more
     )
     environment.globals |= {"arrows": ARROWS, "senses": SENSES}
     environment.globals["tone"] = lambda method: method if method in TONES else "soft"
